@@ -131,8 +131,10 @@ def _count(
 ) -> None:
     """Count the labels that every draw gives to points, in place."""
 
+    averaged_sd = inverse.averaged_sd(near)
+
     def labels_of(draw: int) -> Int[np.ndarray, "k"]:
-        sources = inverse.place_by(draw, places, near)
+        sources = inverse.place_by(draw, places, near, averaged_sd)
         return numbers.nearest(sources)
 
     columns = np.arange(len(places))

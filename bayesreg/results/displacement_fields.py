@@ -42,7 +42,8 @@ class Moments(NamedTuple):
         Posterior mean in the mesh and around it, mm, including the pose.
     sd : (X, Y, Z, 3) array
         Standard deviation, mm, along the axes of the moving image's world. Its square is the sum of two variances:
-        that of the draws, and that of the displacement which the mesh cannot resolve (`bayesreg.model.submesh`). Zero
+        that of the nodes, interpolated as a standard deviation, and that of the displacement which the mesh cannot
+        resolve (`bayesreg.model.submesh`). Zero
         around the mesh.
     rms_sd : dict
         Root mean squares of the two parts over the axes and the voxels in the mesh, mm: "nodes", "mesh".
@@ -82,10 +83,10 @@ def moments_on(transform: Transform, grid: Image) -> Moments:
         mean[block] = pose.displacement(points, mean[block])
     blocks = slices(len(covered.cell), VOXELS)
     parts = [transform.variances(covered.cell[block], covered.barycentric[block]) for block in blocks]
-    drawn, unresolved = np.concatenate(parts, axis=1)
+    nodal, unresolved = np.concatenate(parts, axis=1)
     sd = np.zeros_like(mean)
-    sd[covered_index] = np.sqrt(drawn + unresolved)
-    shape, variances = (*grid.shape, 3), {"nodes": drawn, "mesh": unresolved}
+    sd[covered_index] = np.sqrt(nodal + unresolved)
+    shape, variances = (*grid.shape, 3), {"nodes": nodal, "mesh": unresolved}
     rms = {name: float(np.sqrt(variance.mean())) for name, variance in variances.items()}
     return Moments(mean.reshape(shape), sd.reshape(shape), rms)
 

@@ -46,10 +46,13 @@ class Transform:
 
     Notes
     -----
-    A draw at a point is the draw of the mesh, which is linear in every tetrahedron, plus a draw of the displacement
-    that the mesh cannot resolve (`bayesreg.model.submesh`). The latter has no jumps and is common to all points, so
-    that the draws show how the displacements of several points vary together. Of every two draws, the second has the
-    opposite sign, so that their mean is zero. A run writes the standard deviation of the sum on the grid of its image.
+    A draw at a point is the draw of the mesh, which is linear in every tetrahedron, plus two parts. One is a draw of
+    the displacement that the mesh cannot resolve (`bayesreg.model.submesh`), which has no jumps and is common to all
+    points; of every two draws, the second has the opposite sign, so that their mean is zero. The other is a Normal
+    number: in the middle of a tetrahedron the mesh averages independent errors of the nodes, and the truth is no better
+    known there than at the corners. With it, the variance of the mesh is that of the nodes, interpolated as a standard
+    deviation. All points share these numbers, three for each draw. A run writes the standard deviation of the sum on
+    the grid of its image.
     """
 
     deformer: Deformer
@@ -87,7 +90,16 @@ class Transform:
         location = self.deformer.locate(points)
         return self.pose.place(points + self.mean.displacement(points, location)), location
 
-    def place_by(self, draw: int, points: Float[np.ndarray, "k 3"], near: Location) -> Float[np.ndarray, "k 3"]:
+    @cached_property
+    def _normal_numbers(self) -> Float[np.ndarray, "draws 3"]:
+        """Normal numbers for each draw and axis, with mean zero and variance one over the draws."""
+        numbers = np.random.default_rng((self.seed, len(self.draws))).standard_normal((len(self.draws), 3))
+        numbers -= numbers.mean(axis=0)
+        return numbers / np.maximum(numbers.std(axis=0, ddof=1), 1e-12) if len(numbers) > 1 else numbers
+
+    def place_by(
+        self, draw: int, points: Float[np.ndarray, "k 3"], near: Location, averaged_sd: Float[np.ndarray, "k 3"]
+    ) -> Float[np.ndarray, "k 3"]:
         """Map points by one of the draws, mm.
 
         Parameters
@@ -98,9 +110,11 @@ class Transform:
             The points before the map, mm.
         near : Location
             The locations of the points from `place`.
+        averaged_sd : (k, 3) array
+            From `Transform.averaged_sd` at these locations, mm.
         """
         displaced = self.deformer.displaced(self.draws[draw])
-        beside = self._unresolved_by(draw, near)
+        beside = self._unresolved_by(draw, near) + averaged_sd * self._normal_numbers[draw]
         if self.turned:
             return displaced.sources(self.pose.inverse.place(points), near)[0] - beside
         return self.pose.place(points + displaced.displacement(points, near) + beside)
@@ -120,24 +134,32 @@ class Transform:
         displacement[inside] = self.unresolved.displacement(amplitudes, near.cell[inside], near.barycentric[inside])
         return displacement
 
-    def unresolved_sd(self, near: Location) -> Float[np.ndarray, "k 3"]:
-        """Compute the standard deviation of what the mesh cannot resolve at points, mm; zero around the mesh."""
+    def averaged_sd(self, near: Location) -> Float[np.ndarray, "k 3"]:
+        """Compute the standard deviation that the draws of the mesh lack at points, mm; zero around the mesh."""
         sd, inside = np.zeros((len(near.cell), 3)), self.deformer.is_inside(near)
-        covariance = self.unresolved.covariance_at(near.cell[inside], near.barycentric[inside])
-        sd[inside] = np.sqrt(np.einsum("kii->ki", covariance))
+        cell, share = near.cell[inside], near.barycentric[inside]
+        drawn, interpolated = self._variances(cell, share, np.eye(3))
+        sd[inside] = np.sqrt(interpolated - drawn)
         return sd
+
+    def unresolved_sd(self, near: Location) -> Float[np.ndarray, "k 3"]:
+        """Compute the standard deviation of all that is added to draws of the mesh at points, mm; zero around it."""
+        variance, inside = self.averaged_sd(near) ** 2, self.deformer.is_inside(near)
+        variance[inside] += self.unresolved.variance_at(near.cell[inside], near.barycentric[inside])
+        return np.sqrt(variance)
 
     def covariance(self, near: Location) -> Float[np.ndarray, "k 3 3"]:
         """Compute the posterior covariance of u at points, mm², along the axes of the fixed image's world.
 
-        It is that of the draws plus that of what the mesh cannot resolve. It is NaN around the mesh, where nothing is
-        observed.
+        The notes of `Transform` define it. It is NaN around the mesh, where nothing is observed.
         """
         inside = self.deformer.is_inside(near)
         cell, share = near.cell[inside], near.barycentric[inside]
         total = self.unresolved.covariance_at(cell, share)
         for a, b in product(range(4), repeat=2):
             total += (share[:, a] * share[:, b])[:, None, None] * self._cell_covariance[cell, a, b]
+        drawn, interpolated = self._variances(cell, share, np.eye(3))
+        total += (interpolated - drawn)[:, :, None] * np.eye(3)
         covariance = np.full((len(near.cell), 3, 3), np.nan)
         covariance[inside] = total
         return covariance
@@ -145,14 +167,24 @@ class Transform:
     def variances(self, cell: Int[np.ndarray, "k"], share: Float[np.ndarray, "k 4"]) -> Float[np.ndarray, "2 k 3"]:
         """Compute the variances of u at points in tetrahedra, mm², along the axes of the moving image's world.
 
-        The first is that of the draws, and the second that of what the mesh cannot resolve.
+        The first is that of the nodes, interpolated as a standard deviation, and the second that of what the mesh
+        cannot resolve.
         """
-        along = np.einsum("ij,mabjk,ik->mabi", self.pose.rotation, self._cell_covariance, self.pose.rotation)
+        _, interpolated = self._variances(cell, share, self.pose.rotation)
+        return np.stack([interpolated, self.unresolved.turned(self.pose.rotation).variance_at(cell, share)])
+
+    def _variances(
+        self, cell: Int[np.ndarray, "k"], share: Float[np.ndarray, "k 4"], axes: Float[np.ndarray, "3 3"]
+    ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3"]]:
+        """Compute the variance of the draws at points along some axes (rows), and that of the nodes, interpolated."""
+        along = np.einsum("ij,mabjk,ik->mabi", axes, self._cell_covariance, axes)
         drawn = np.zeros((len(cell), 3))
         for a, b in combinations_with_replacement(range(4), 2):
             times = 1 if a == b else 2
             drawn += (times * share[:, a] * share[:, b])[:, None] * along[cell, a, b]
-        return np.stack([np.maximum(drawn, 0), self.unresolved.turned(self.pose.rotation).variance_at(cell, share)])
+        nodal = np.sqrt(np.einsum("maai->mai", along))
+        interpolated = np.einsum("ka,kai->ki", share, nodal[cell]) ** 2
+        return np.clip(drawn, 0, interpolated), interpolated
 
     def nodal_covariance(self) -> Float[np.ndarray, "nodes 3 3"]:
         """Compute the posterior covariance of u at the nodes, mm²."""
@@ -229,7 +261,10 @@ def spread(transform: Transform, points: Float[np.ndarray, "k 3"], far: Sequence
     inside_index = np.flatnonzero(inside)
     location = Location(near.cell[inside_index], near.barycentric[inside_index])
     square, beyond_far = np.zeros((len(inside_index), 3, 3)), np.zeros((len(far), len(inside_index)))
-    for drawn_places in transform.for_each_draw(lambda draw: transform.place_by(draw, points[inside_index], location)):
+    sd = transform.averaged_sd(location)
+    for drawn_places in transform.for_each_draw(
+        lambda draw: transform.place_by(draw, points[inside_index], location, sd)
+    ):
         away = drawn_places - places[inside_index]
         square += away[:, :, None] * away[:, None]
         distance = np.linalg.norm(away, axis=1)

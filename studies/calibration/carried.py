@@ -135,7 +135,9 @@ def _improbable(transform: Transform, points: np.ndarray, true_places: np.ndarra
     """Return the probability of the region that contains the true place, for each of `COVARIANCES`."""
     predicted = spread(transform, points)
     _, location = transform.place(points)
-    drawn = transform.covariance(location) - transform.unresolved.covariance_at(location.cell, location.barycentric)
+    added = transform.unresolved.covariance_at(location.cell, location.barycentric)
+    added += transform.averaged_sd(location)[:, :, None] ** 2 * np.eye(3)
+    drawn = transform.covariance(location) - added
     away = true_places - predicted.places
     return np.concatenate([region_probability(away, covariance) for covariance in (predicted.covariance, drawn)])
 

@@ -27,7 +27,8 @@ def main() -> None:
     # The errors are along the axes of the world of the fixed image, as the covariance of u.
     away = (points.moving - places) @ transform.pose.rotation
     covariance = transform.covariance(near)
-    drawn = covariance - transform.unresolved.covariance_at(near.cell, near.barycentric)
+    added = transform.unresolved.covariance_at(near.cell, near.barycentric)
+    drawn = covariance - added - transform.averaged_sd(near)[:, :, None] ** 2 * np.eye(3)
     print(f"{len(places)} points, mean error {np.linalg.norm(away, axis=1).mean():.3f} mm")
     for name, matrix in {"ellipsoids of points.csv": covariance, "of the draws alone": drawn}.items():
         inside = region_probability(away, matrix)

@@ -134,13 +134,14 @@ def test_label_probabilities_are_those_of_brute_force(turned):
     _, near = inverse.place(places)
     # Every voxel by every draw; what the mesh cannot resolve moves the open voxels alone.
     open_near = type(near)(near.cell[carried.open], near.barycentric[carried.open])
+    sd = inverse.averaged_sd(open_near)
     brute = {value: np.zeros(len(places)) for value in (2, 5, 70)}
     for draw, u in enumerate(inverse.draws):
         if inverse.turned:
             source = inverse.deformer.displaced(u).sources(inverse.pose.inverse.place(places))[0]
         else:
             source = inverse.pose.place(places + inverse.deformer.displaced(u).displacement(places, near))
-        source[carried.open] = inverse.place_by(draw, places[carried.open], open_near)
+        source[carried.open] = inverse.place_by(draw, places[carried.open], open_near, sd)
         for value, count in brute.items():
             count += labels.nearest(source) == value
     for value, probability in carried.probabilities():
@@ -220,6 +221,7 @@ def _true_place(way, points, u, rng):
     _, near = way.place(points)
     drawn = way.unresolved.draw((int(rng.integers(2**32)),))
     beside = way.unresolved.displacement(drawn, near.cell, near.barycentric)
+    beside += way.averaged_sd(near) * rng.standard_normal(points.shape)
     displaced = way.deformer.displaced(u)
     if way.turned:
         return displaced.sources(way.pose.inverse.place(points))[0] - beside
