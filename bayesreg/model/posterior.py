@@ -154,16 +154,20 @@ class Posterior:
         correlated = {
             name: observation for name, observation in self.observations.items() if isinstance(observation, Correlated)
         }
-        counts = {
+        pairs = [
+            term for term in self.data.terms.values() if isinstance(term, ComparedImages) and term.name in correlated
+        ]
+        by_patches = [term for term in pairs if term.is_pointwise and len(self.sampled) == len(self.mesh.points)]
+        counts: dict[str, float] = {}
+        if by_patches:
+            size = 3 * len(self.sampled)
+            curvature = displacement_curvature(self.data, filled, u).gauss_newton[-size:, -size:]
+            counts = {term.name: term.count_by_patches(u, filled, curvature) for term in by_patches}
+        return counts | {
             name: observation.count_independent_points(self.data.terms[name], u, filled)
             for name, observation in correlated.items()
+            if name not in counts
         }
-        pairs = [term for term in self.data.terms.values() if isinstance(term, ComparedImages) and term.name in counts]
-        if len(self.sampled) < len(self.mesh.points) or not pairs:
-            return counts
-        rows = displacement_curvature(self.data, filled, u).gauss_newton
-        curvature = rows[len(rows) - 3 * len(self.sampled) :, len(rows) - 3 * len(self.sampled) :]
-        return counts | {term.name: term.count_by_patches(u, filled, curvature) for term in pairs if term.is_pointwise}
 
     def with_independent_points(self, counts: Mapping[str, float]) -> Posterior:
         """Return the posterior with each pair of images tempered to its count of independent points."""

@@ -138,8 +138,7 @@ class Transform:
         """Compute the standard deviation that the draws of the mesh lack at points, mm; zero around the mesh."""
         sd, inside = np.zeros((len(near.cell), 3)), self.deformer.is_inside(near)
         cell, share = near.cell[inside], near.barycentric[inside]
-        drawn, interpolated = self._variances(cell, share, np.eye(3))
-        sd[inside] = np.sqrt(interpolated - drawn)
+        sd[inside] = np.sqrt(self._averaged_variance(cell, share, self._drawn_covariance(cell, share)))
         return sd
 
     def unresolved_sd(self, near: Location) -> Float[np.ndarray, "k 3"]:
@@ -155,13 +154,10 @@ class Transform:
         """
         inside = self.deformer.is_inside(near)
         cell, share = near.cell[inside], near.barycentric[inside]
-        total = self.unresolved.covariance_at(cell, share)
-        for a, b in product(range(4), repeat=2):
-            total += (share[:, a] * share[:, b])[:, None, None] * self._cell_covariance[cell, a, b]
-        drawn, interpolated = self._variances(cell, share, np.eye(3))
-        total += (interpolated - drawn)[:, :, None] * np.eye(3)
+        drawn = self._drawn_covariance(cell, share)
+        averaged = self._averaged_variance(cell, share, drawn)[:, :, None] * np.eye(3)
         covariance = np.full((len(near.cell), 3, 3), np.nan)
-        covariance[inside] = total
+        covariance[inside] = drawn + averaged + self.unresolved.covariance_at(cell, share)
         return covariance
 
     def variances(self, cell: Int[np.ndarray, "k"], share: Float[np.ndarray, "k 4"]) -> Float[np.ndarray, "2 k 3"]:
@@ -170,21 +166,31 @@ class Transform:
         The first is that of the nodes, interpolated as a standard deviation, and the second that of what the mesh
         cannot resolve.
         """
-        _, interpolated = self._variances(cell, share, self.pose.rotation)
+        interpolated = self._interpolated_variance(cell, share, self.pose.rotation)
         return np.stack([interpolated, self.unresolved.turned(self.pose.rotation).variance_at(cell, share)])
 
-    def _variances(
+    def _interpolated_variance(
         self, cell: Int[np.ndarray, "k"], share: Float[np.ndarray, "k 4"], axes: Float[np.ndarray, "3 3"]
-    ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3"]]:
-        """Compute the variance of the draws at points along some axes (rows), and that of the nodes, interpolated."""
-        along = np.einsum("ij,mabjk,ik->mabi", axes, self._cell_covariance, axes)
-        drawn = np.zeros((len(cell), 3))
-        for a, b in combinations_with_replacement(range(4), 2):
-            times = 1 if a == b else 2
-            drawn += (times * share[:, a] * share[:, b])[:, None] * along[cell, a, b]
-        nodal = np.sqrt(np.einsum("maai->mai", along))
-        interpolated = np.einsum("ka,kai->ki", share, nodal[cell]) ** 2
-        return np.clip(drawn, 0, interpolated), interpolated
+    ) -> Float[np.ndarray, "k 3"]:
+        """Compute the variance of the nodes along some axes (rows), interpolated at points as a standard deviation."""
+        nodal = np.sqrt(np.einsum("ij,maajk,ik->mai", axes, self._cell_covariance, axes))
+        return np.einsum("ka,kai->ki", share, nodal[cell]) ** 2
+
+    def _drawn_covariance(
+        self, cell: Int[np.ndarray, "k"], share: Float[np.ndarray, "k 4"]
+    ) -> Float[np.ndarray, "k 3 3"]:
+        """Compute the covariance of the draws of the mesh, which are linear in every tetrahedron, at points, mm²."""
+        total = np.zeros((len(cell), 3, 3))
+        for a, b in product(range(4), repeat=2):
+            total += (share[:, a] * share[:, b])[:, None, None] * self._cell_covariance[cell, a, b]
+        return total
+
+    def _averaged_variance(
+        self, cell: Int[np.ndarray, "k"], share: Float[np.ndarray, "k 4"], drawn: Float[np.ndarray, "k 3 3"]
+    ) -> Float[np.ndarray, "k 3"]:
+        """Compute the variance that the draws of the mesh lack at points, mm²."""
+        interpolated = self._interpolated_variance(cell, share, np.eye(3))
+        return np.maximum(interpolated - np.einsum("kii->ki", drawn), 0)
 
     def nodal_covariance(self) -> Float[np.ndarray, "nodes 3 3"]:
         """Compute the posterior covariance of u at the nodes, mm²."""
