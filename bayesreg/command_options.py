@@ -15,18 +15,21 @@ FixedImage = Annotated[
 MovingImage = Annotated[
     Path | None, typer.Argument(metavar="MOVING]", help="Intra-operative image.", show_default=False)
 ]
-LandmarksFile = Annotated[
-    Path | None,
+LandmarksFiles = Annotated[
+    list[Path] | None,
     typer.Option(
-        "--landmarks", metavar="FILE", help="Pairs of points: CSV with fixed_x … moving_z (RAS, mm), or .tag."
+        "--landmarks",
+        metavar="FILE",
+        help="Pairs of points: CSV with fixed_x … moving_z (RAS, mm), or .tag; may be repeated.",
     ),
 ]
-MeasuredSurfaceFile = Annotated[
-    Path | None,
+MeasuredSurfaceFiles = Annotated[
+    list[Path] | None,
     typer.Option(
         "--surface",
         metavar="FILE",
-        help="Points on the moved surface of the organ, without partners: .ply, .stl, .vtk, .csv with x, y, z, …",
+        help="Points on the moved surface of the organ, without partners (.ply, .stl, .vtk, .csv with x, y, z, …); may "
+        "be repeated.",
     ),
 ]
 LabelFile = Annotated[

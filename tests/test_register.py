@@ -214,17 +214,17 @@ def test_the_voxels_of_a_file_are_read_once(tmp_path, monkeypatch):
 def test_a_surface_needs_no_images(register, tmp_path):
     points = tmp_path / "laser.csv"
     points.write_text("x,y,z\n" + "\n".join(f"{k},1,2" for k in range(12)))
-    config = understand(labels=Path(register.path("labels")), surface=points).config
+    config = understand(labels=Path(register.path("labels")), surfaces=[points]).config
     assert [(section.kind, section.file) for section in config.observations] == [("surface", points)]
     assert (config.model.elasticity, config.model.rigid_sd) == ("uniform", 1.0)
-    both = understand(labels=Path(register.path("labels")), surface=points, landmarks=points).config
+    both = understand(labels=Path(register.path("labels")), surfaces=[points], landmarks=[points]).config
     assert [section.kind for section in both.observations] == ["landmarks", "surface"]
     assert both.model.rigid_sd is None
-    lost = understand(labels=Path(register.path("labels")), surface=points, overrides=["data.pose=unknown"])
+    lost = understand(labels=Path(register.path("labels")), surfaces=[points], overrides=["data.pose=unknown"])
     assert lost.config.model.rigid_sd == 10.0
     assert "pose        looked for by the surface, each rigid motion to 10 mm (model.rigid_sd)" in lost.lines
     images = [Path(register.path(name)) for name in ("fixed", "moving")]
-    assert understand(*images, surface=points, overrides=["data.pose=unknown"]).config.model.rigid_sd is None
+    assert understand(*images, surfaces=[points], overrides=["data.pose=unknown"]).config.model.rigid_sd is None
 
 
 def test_points_need_no_images(register):

@@ -93,7 +93,8 @@ def _read_csv(text: str, path: str, space: Space | None) -> Points | PointPairs:
     ]
     system = _space_of(text, space, path)
     if not lines:
-        raise InputError(f"{path} is empty; expected a header such as {','.join(PLAIN)}")
+        pairs, points = (",".join(names) for names in (FIXED + MOVING, PLAIN))
+        raise InputError(f"{path} is empty; expected a header: {pairs} for pairs, or {points}")
     header, *rows = [(number, [cell.strip() for cell in next(csv.reader([line]))]) for number, line in lines]
     columns = [column.lower() for column in header[1]]
     wanted = FIXED + MOVING if set(FIXED + MOVING) <= set(columns) else PLAIN
@@ -106,6 +107,8 @@ def _read_csv(text: str, path: str, space: Space | None) -> Points | PointPairs:
         )
     if twice := [column for column in (*wanted, "sd", "name") if columns.count(column) > 1]:
         raise InputError(f"{path}: expected one column {twice[0]}; got {', '.join(header[1])}")
+    if not set(wanted) <= set(columns) and ";" in header[1][0]:
+        raise InputError(f"{path} separates its columns by semicolons; expected commas, and points in decimal numbers")
     if not set(wanted) <= set(columns):
         raise InputError(
             f"{path}: expected a header with {', '.join(FIXED + MOVING)}, with these and "

@@ -111,8 +111,8 @@ def _read_once(path: str | Path, moving: str | Path | None) -> PointPairs:
         return points
     if moving is None:
         raise InputError(
-            f"{path} holds points of one space; give the points of the moving image, too, or a CSV with the columns "
-            "fixed_x, fixed_y, fixed_z, moving_x, moving_y, moving_z"
+            f"{path} holds points of one space; give the points of the moving image, too (in YAML, moving_file beside "
+            "file), or a CSV with the columns fixed_x, fixed_y, fixed_z, moving_x, moving_y, moving_z"
         )
     moving_points = _read(Path(moving))
     if isinstance(moving_points, PointPairs):
@@ -187,7 +187,8 @@ def _places(pairs: PointPairs) -> Float[np.ndarray, "k coordinates"]:
 def _require_sound(points: Points | PointPairs, path: Path) -> None:
     places = points.defined.points if isinstance(points, Points) else _places(points)
     if not len(places):
-        raise InputError(f"{path} holds no point")
+        undefined = len(points.undefined) if isinstance(points, Points) else 0
+        raise InputError(f"{path} holds no point" + f" with a position, and {undefined} without one" * bool(undefined))
     require_printable(points.names, str(path))
     if not np.isfinite(places).all():
         raise InputError(f"{path}: point {1 + int(np.argwhere(~np.isfinite(places))[0, 0])} is not finite")

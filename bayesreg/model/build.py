@@ -109,8 +109,9 @@ def _require_bounded(posterior: Posterior) -> None:
     points = np.concatenate([*(points for points in bounding if points is not None), held])
     if not determine_pose(points):
         raise InputError(
-            f"{len(points)} landmarks and held nodes do not say how the whole shifts and turns: the posterior would be "
-            "improper; give at least three that are not on one line, images, a skull, or model.rigid_sd"
+            f"the landmarks and held nodes, {len(points)} in number, do not say how the whole shifts and turns: the "
+            "posterior would be improper; give at least three that are not on one line, images, a skull, or "
+            "model.rigid_sd"
         )
 
 

@@ -34,5 +34,5 @@ def suspect_other_reading(points: Float[np.ndarray, "k 3"], grids: Mapping[str, 
     near = lie_near(here, points)
     if near.all():
         return ""
-    of_other = Reading(f"points of the {image} image", remedy, lie_near(there, points))
+    of_other = Reading(f"points of the {image} image", remedy, there, points)
     return suspect_reading(near, [*other_readings(here, points, grids), of_other])

@@ -31,8 +31,8 @@ def check(config: str | Path | Config) -> Check:
     """
     config = config if isinstance(config, Config) else load_config(config)
     inputs, provenance = prepared_inputs(config)
-    _log.info("%s", describe_inputs(provenance["appraisal"]))
     posterior = posterior_of(config, inputs)
+    _log.info("%s", describe_inputs(provenance["appraisal"]))
     start = start_of(config, inputs, posterior)
     options, trial, reached = config.sampler, 10, []
 

@@ -51,8 +51,8 @@ def understand(
     channels: Sequence[str] = (),
     overrides: Sequence[str] = (),
     quick: bool = False,
-    landmarks: Path | None = None,
-    surface: Path | None = None,
+    landmarks: Sequence[Path] = (),
+    surfaces: Sequence[Path] = (),
 ) -> Understood:
     """Make the configuration of a pair in files.
 
@@ -76,9 +76,9 @@ def understand(
         As in `bayesreg.load_config`.
     quick : bool
         Whether the run ends at draws from Laplace's approximation.
-    landmarks : path, optional
+    landmarks : sequence of path
         Pairs of points that show the same places.
-    surface : path, optional
+    surfaces : sequence of path
         Points on the moved surface of the organ, without partners. Where nothing else is observed, the rigid motion
         has a prior of sd `RIGID_SD`, since a part of a surface says little about it; of `RIGID_SD_OF_FOUND` with
         data.pose=unknown.
@@ -91,7 +91,7 @@ def understand(
     """
     if (fixed is None) != (moving is None):
         raise InputError(f"{fixed or moving} is one image; give FIXED and MOVING, or no image")
-    if fixed is None and landmarks is None and surface is None:
+    if fixed is None and not landmarks and not surfaces:
         raise InputError("nothing is observed; give two images, --landmarks or --surface")
     if fixed is None and labels is None:
         raise InputError("without images, --labels says where the organ is: a mask, or labels of its tissues")
@@ -108,21 +108,29 @@ def understand(
     sections["observations"] = [
         *pair,
         *(_channel(k, paths) for k, paths in enumerate(channels, 2)),
-        *([] if landmarks is None else [{"kind": "landmarks", "file": str(landmarks.absolute())}]),
-        *([] if surface is None else [{"kind": "surface", "file": str(surface.absolute())}]),
+        *_of_files("landmarks", landmarks),
+        *_of_files("surface", surfaces),
     ]
     if fixed is None:
         # Points and surfaces hardly tell tissues apart, and one stiffness takes a tenth of the time.
-        sections["model"] = {"elasticity": "uniform", **({} if landmarks is not None else {"rigid_sd": RIGID_SD})}
+        sections["model"] = {"elasticity": "uniform", **({} if landmarks else {"rigid_sd": RIGID_SD})}
     if quick:
         sections |= QUICK
     config = make_config(sections, overrides)
-    if fixed is None and isinstance(config.data, FilesData) and config.data.pose == "unknown" and landmarks is None:
+    if fixed is None and isinstance(config.data, FilesData) and config.data.pose == "unknown" and not landmarks:
         sections["model"]["rigid_sd"] = RIGID_SD_OF_FOUND
         config = make_config(sections, overrides)
     if any(override.startswith("data.label_table") for override in overrides):
         how = "as set"
     return Understood(config, tuple(_describe(config, how)))
+
+
+def _of_files(kind: str, paths: Sequence[Path]) -> list[dict[str, str]]:
+    """Make an observation of a kind for each file; each has a name of its own."""
+    return [
+        {"kind": kind, "file": str(path.absolute()), "name": kind if number == 1 else f"{kind}_{number}"}
+        for number, path in enumerate(paths, 1)
+    ]
 
 
 def _describe(config: Config, how: str) -> Iterator[str]:

@@ -106,3 +106,64 @@ def test_a_point_of_its_own_that_lies_out_is_no_ground_for_a_suspicion(caplog):
     placed(fixed, moving, grids={"the labels": GRID})
     (sentence,) = caplog.messages
     assert sentence.endswith("edges (22.4 mm): 3; they are left out.")
+
+
+@pytest.mark.parametrize(
+    ("reading", "claim"),
+    [
+        (GRID.world_to_voxel, "voxel indices of the labels; then convert them"),
+        (lambda moving: moving * (-1, -1, 1), "by which LPS and RAS differ; then state the right one"),
+        (lambda moving: moving / 1000, "in metres; then convert them to mm"),
+    ],
+    ids=["voxels", "LPS", "metres"],
+)
+def test_another_reading_of_the_moving_points_is_refused(reading, claim):
+    fixed, moving = pairs()
+    with pytest.raises(
+        br.InputError, match=r"half of the moving points lie more than .* from their partners.*" + claim
+    ):
+        placed(fixed, reading(moving), grids={"the labels": GRID})
+
+
+def test_most_points_out_of_the_organ_are_refused_where_another_reading_fits():
+    fixed, moving = pairs()
+    shift = np.where(np.arange(12) % 3, 70.0, 0.0)[:, None] * (1, 0, 0)
+    with pytest.raises(br.InputError, match=r"8 of 12 points lie .* 12 of 12 would lie .* if they were swapped"):
+        placed(moving + shift, fixed)
+
+
+def test_moving_points_of_other_coordinates_are_told(caplog):
+    fixed, moving = pairs()
+    placed(fixed, moving + np.array([0, 0, 300.0]))
+    (sentence,) = caplog.messages
+    assert "lie more than 300 mm away from their partners" in sentence
+    assert "data.pose: unknown" in sentence
+
+
+def test_pairs_in_another_order_are_told(caplog):
+    fixed, moving = pairs(30)
+    placed(fixed, np.roll(moving, 7, axis=0))
+    (sentence,) = caplog.messages
+    assert "are the fixed and the moving points in the same order?" in sentence
+
+
+@pytest.mark.parametrize("kind", ["landmarks", "surface"])
+def test_points_in_metres_about_the_origin_are_refused(kind):
+    """They all lie within the organ, if the organ lies about the origin."""
+    mesh = br.TetMesh.from_arrays(BOX.points - 20, BOX.cells, np.zeros(len(BOX.cells), int), ("organ",))
+    points = np.random.default_rng(0).uniform(-18, 18, (12, 3)) / 1000
+    own = br.Landmarks(points, points, 1.0) if kind == "landmarks" else br.Surface(points)
+    with pytest.raises(br.InputError, match=r"all 12 points lie within .* are they in metres"):
+        br.build_posterior(mesh, [own], MODEL)
+
+
+@pytest.mark.parametrize(
+    ("reading", "claim"),
+    [(GRID.world_to_voxel, "voxel indices of the labels"), (lambda points: points / 1000, "are they in metres")],
+    ids=["voxels", "metres"],
+)
+def test_another_reading_of_a_surface_is_refused(reading, claim):
+    labels = GRID.with_voxels(np.ones(GRID.voxels.shape, int))
+    points = CORNER + np.random.default_rng(0).uniform(0, 40, (30, 3)) * (1, 1, 0)
+    with pytest.raises(br.InputError, match=claim):
+        br.build_posterior(MESH, [br.Surface(reading(points), tissue=labels)], MODEL)

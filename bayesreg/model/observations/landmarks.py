@@ -28,10 +28,12 @@ from bayesreg.model.observations.observation import Placed, Recorded
 from bayesreg.model.observations.odd_points import (
     Reading,
     describe_contradictions,
+    describe_partners,
     describe_plane,
     first_of_each,
-    lie_near,
     other_readings,
+    require_extent,
+    require_partners,
     suspect_reading,
 )
 from bayesreg.model.observations.point_noise import NormalNoise, StudentTNoise
@@ -50,8 +52,9 @@ UNKNOWN_SD = ScalePrior(median=1.0, log_sd=2.0)
 READINGS_LOG_SD = 0.7
 # The sd of the displacement's change over a distance outside the mesh, over this distance: a strain that tissue has.
 STRAIN = 0.2
-# The least number of landmarks if others lie too far outside the mesh.
-FEWEST = 4
+# The least number of landmarks if others lie too far outside the mesh, and the least share if more would lie near it by
+# another reading.
+FEWEST, MOST = 4, 0.5
 # The greatest number of unknowns for which the memory suffices to leave landmarks out in turn, and of these unknowns
 # times the coordinates of the landmarks.
 MOST_UNKNOWNS, MOST_ENTRIES = 12_000, 20_000_000
@@ -141,9 +144,10 @@ class Landmarks:
         Raises
         ------
         InputError
-            If points lie so far outside of the mesh that fewer than `FEWEST` are left.
+            If points lie so far outside of the mesh that fewer than `FEWEST` are left, or if another reading, such as
+            voxel indices, fits much better.
         """
-        observation = self._counted_once()._near(mesh)._examined()
+        observation = self._counted_once()._near(mesh)._examined(mesh)
         for sentence in observation.remarks:
             _log.warning("%s", sentence)
         nodes, weights, distance = nearest_places(mesh, observation.fixed_points)
@@ -170,13 +174,12 @@ class Landmarks:
 
     def _near(self, mesh: TetMesh) -> Landmarks:
         """Return the landmarks that lie no further outside the mesh than its edges are long; say which do not."""
+        require_extent(self.name, mesh, self.fixed_points)
         distance, reach = nearest_places(mesh, self.fixed_points)[2], mesh.boundary_edge
         near = distance <= reach
         if near.all():
             return self
-        swap = Reading(
-            "swapped with their partners", "swap the fixed and moving points", lie_near(mesh, self.moving_points)
-        )
+        swap = Reading("swapped with their partners", "swap the fixed and moving points", mesh, self.moving_points)
         suspicion = suspect_reading(near, [*other_readings(mesh, self.fixed_points, self.grids), swap])
         labels = join_some([self.labels[k] for k in np.flatnonzero(~near)])
         sentence = (
@@ -186,6 +189,8 @@ class Landmarks:
         if near.sum() < FEWEST:
             question = "are they in the space of the fixed image (world RAS, mm), and is the organ meshed whole?"
             raise InputError(f"{sentence}fewer than {FEWEST} points are left; {suspicion or question}")
+        if suspicion and near.mean() < MOST:
+            raise InputError(f"{sentence}{suspicion}")
         return self._selected(near, f"{sentence}they are left out{'; ' * bool(suspicion)}{suspicion}.")
 
     def _selected(self, kept: Bool[np.ndarray, "k"], reason: str) -> Landmarks:
@@ -198,13 +203,15 @@ class Landmarks:
         observation.remarks = (*self.remarks, reason)
         return observation
 
-    def _examined(self) -> Landmarks:
+    def _examined(self, mesh: TetMesh) -> Landmarks:
         """Return the landmarks with remarks on what remains odd about them."""
+        require_partners(self.name, mesh, self.fixed_points, self.moving_points, self.grids)
         observation = copy(self)
         observation.remarks = (
             *self.remarks,
             *describe_contradictions(self.name, self.fixed_points, self.moving_points, self.labels),
             *describe_plane(self.name, self.fixed_points),
+            *describe_partners(self.name, mesh, self.fixed_points, self.moving_points),
         )
         return observation
 

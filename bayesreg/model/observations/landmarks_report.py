@@ -70,10 +70,12 @@ def _caption(summary: Arrays) -> str:
         return f"{text} They were not left out in turn: no node is sampled, or there are too many."
     if np.isnan(summary["left_out_share"]).all():
         return f"{text} Left out, no landmark is determined by the other observations."
-    mean = np.nanmean(np.linalg.norm(summary["left_out_residual"], axis=1))
+    probably_right = np.delete(np.arange(len(summary["names"])), _probably_wrong(summary))
+    mean = np.nanmean(np.linalg.norm(summary["left_out_residual"][probably_right], axis=1))
+    without = " without the probably wrong ones" * (len(probably_right) < len(summary["names"]))
     return (
         f"{text} Left out: the same distance where all other observations predict the landmark (beside images, at the "
-        f"mean stiffness and scales, which have seen it); its mean is {mean:.3g} mm. Its region: the share of "
+        f"mean stiffness and scales, which have seen it); its mean{without} is {mean:.3g} mm. Its region: the share of "
         "landmarks with their own errors, simulated by that prediction, that lie nearer. "
         f"{_describe_coverage(summary)} "
         f"{' '.join(_describe_intervals(summary)) or 'Chance allows such numbers.'}"

@@ -2,25 +2,33 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from bayesreg.fem.location import nearest_places
 from bayesreg.image import Image
 from bayesreg.io.spaces import LPS
 from bayesreg.mesh import TetMesh
 from bayesreg.printable import join_some
+from bayesreg.types import InputError
 
 # Points nearer than this are one place, mm.
 ONE_PLACE = 1e-3
 # Points lie in one plane if they are thinner than this share of their width.
 FLAT = 0.05
-# Another reading fits clearly better if this share of all points lies near the mesh by it alone.
+# Another reading fits clearly better if this share of all points lies near the mesh by it alone, and one of moving
+# points if it brings them to this share of their distance from their partners.
 CLEARLY = 0.25
+# Points are a spot, as points in metres are, if they spread over less than this share of the size of the mesh.
+SPOT = 0.01
+# Pairs are in disorder if the best rigid motion leaves partners further apart than this share of the points' spread.
+DISORDER = 0.5
 
 
 class Reading(NamedTuple):
@@ -32,13 +40,21 @@ class Reading(NamedTuple):
         What the points then are, after "if they were".
     remedy : str
         What to do if this is the right reading, after "then".
-    near : (k,) bool array
-        Whether each point then lies near the mesh (`lie_near`).
+    mesh : TetMesh
+        The mesh near which they then lie.
+    points : (k, 3) array
+        The points by this reading, world RAS mm.
     """
 
     name: str
     remedy: str
-    near: Bool[np.ndarray, "k"]
+    mesh: TetMesh
+    points: Float[np.ndarray, "k 3"]
+
+    @property
+    def near(self) -> Bool[np.ndarray, "k"]:
+        """Whether each point then lies near the mesh."""
+        return lie_near(self.mesh, self.points)
 
 
 def lie_near(mesh: TetMesh, points: Float[np.ndarray, "k 3"]) -> Bool[np.ndarray, "k"]:
@@ -47,17 +63,18 @@ def lie_near(mesh: TetMesh, points: Float[np.ndarray, "k 3"]) -> Bool[np.ndarray
 
 
 def other_readings(mesh: TetMesh, points: Float[np.ndarray, "k 3"], grids: Mapping[str, Image]) -> list[Reading]:
-    """Read points in the other of LPS and RAS, and as voxel indices of grids, by names such as "the labels"."""
+    """Read points in the other of LPS and RAS, in metres, and as voxel indices of grids, named such as "the labels"."""
     mirrored = Reading(
         "of the other sign in x and y, by which LPS and RAS differ",
         "state the right one, in a CSV by a line such as # CoordinateSystem = LPS",
-        lie_near(mesh, points * LPS),
+        mesh,
+        points * LPS,
     )
     by_voxels = [
-        Reading(f"voxel indices of {name}", "convert them to world mm", lie_near(mesh, grid.voxel_to_world(points)))
+        Reading(f"voxel indices of {name}", "convert them to world mm", mesh, grid.voxel_to_world(points))
         for name, grid in grids.items()
     ]
-    return [mirrored, *by_voxels]
+    return [mirrored, *by_voxels, Reading("in metres", "convert them to mm", mesh, 1000 * points)]
 
 
 def suspect_reading(near: Bool[np.ndarray, "k"], others: Sequence[Reading]) -> str:
@@ -70,11 +87,73 @@ def suspect_reading(near: Bool[np.ndarray, "k"], others: Sequence[Reading]) -> s
     others : sequence of Reading
         Of two that fit alike, the first is told.
     """
-    best = max(others, key=lambda reading: np.count_nonzero(reading.near))
-    count = np.count_nonzero(best.near)
+    counts = [np.count_nonzero(reading.near) for reading in others]
+    best, count = others[int(np.argmax(counts))], max(counts)
     if count - np.count_nonzero(near) <= CLEARLY * len(near):
         return ""
     return f"{count} of {len(near)} would lie in the mesh or near it if they were {best.name}; then {best.remedy}"
+
+
+def require_extent(name: str, mesh: TetMesh, points: Float[np.ndarray, "k 3"]) -> None:
+    """Raise InputError if several points fill only a spot of the organ, as points in metres do."""
+    extent, size = np.ptp(points, axis=0).max(), np.ptp(mesh.points, axis=0).max()
+    if len(points) > 3 and 0 < extent < SPOT * size:
+        raise InputError(
+            f"{name}: all {len(points)} points lie within {extent:.2g} mm of each other, in an organ of {size:.0f} mm; "
+            "are they in metres? Convert them to mm"
+        )
+
+
+def require_partners(
+    name: str,
+    mesh: TetMesh,
+    fixed: Float[np.ndarray, "k 3"],
+    moving: Float[np.ndarray, "k 3"],
+    grids: Mapping[str, Image],
+) -> None:
+    """Raise InputError if the moving points lie much nearer to their partners by another reading."""
+    others = other_readings(mesh, moving, grids)
+    distances = [_median_distance(reading.points, fixed) for reading in others]
+    given, best = _median_distance(moving, fixed), int(np.argmin(distances))
+    if given > mesh.boundary_edge and distances[best] < CLEARLY * given:
+        raise InputError(
+            f"{name}: half of the moving points lie more than {given:.3g} mm away from their partners, and "
+            f"{distances[best]:.3g} mm if they were {others[best].name}; then {others[best].remedy}. If they are "
+            "right, data.pose: unknown takes them as they are"
+        )
+
+
+def describe_partners(
+    name: str, mesh: TetMesh, fixed: Float[np.ndarray, "k 3"], moving: Float[np.ndarray, "k 3"]
+) -> list[str]:
+    """Return a sentence if the moving points fit no motion, as in another order, or lie far from their partners."""
+    away, moved = fixed - fixed.mean(axis=0), moving - moving.mean(axis=0)
+    left, spread = (length / np.sqrt(len(fixed)) for length in (_rigid_distance(away, moved), np.linalg.norm(away)))
+    if len(fixed) > 3 and left > DISORDER * spread:
+        return [
+            f"{name}: the best rigid motion leaves the points {left:.0f} mm away from their partners (root mean "
+            f"square), and they lie {spread:.0f} mm around their centre; are the fixed and the moving points in the "
+            "same order?"
+        ]
+    distance = _median_distance(moving, fixed)
+    if distance > np.ptp(mesh.points, axis=0).max() / 2:
+        return [
+            f"{name}: half of the moving points lie more than {distance:.0f} mm away from their partners; if both are "
+            "in mm, but of other coordinates, data.pose: unknown aligns them."
+        ]
+    return []
+
+
+def _median_distance(points: Float[np.ndarray, "k 3"], others: Float[np.ndarray, "k 3"]) -> float:
+    return float(np.median(np.linalg.norm(points - others, axis=1)))
+
+
+def _rigid_distance(points: Float[np.ndarray, "k 3"], others: Float[np.ndarray, "k 3"]) -> float:
+    """Compute the root of the sum of squared distances that the best rotation leaves between points and others."""
+    with warnings.catch_warnings():
+        # Points on a line have many best rotations, all with the same distance.
+        warnings.simplefilter("ignore", UserWarning)
+        return float(Rotation.align_vectors(others, points)[1])
 
 
 def first_of_each(fixed: Float[np.ndarray, "k 3"], moving: Float[np.ndarray, "k 3"]) -> Int[np.ndarray, "distinct"]:
@@ -101,8 +180,8 @@ def describe_contradictions(
 
 
 def describe_plane(name: str, points: Float[np.ndarray, "k 3"]) -> list[str]:
-    """Return a sentence if all points, three or more, lie nearly in one plane."""
-    if len(points) < 3:
+    """Return a sentence if all points, four or more, lie nearly in one plane."""
+    if len(points) < 4:
         return []
     _, width, thickness = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     if thickness > FLAT * width:

@@ -7,12 +7,13 @@ of the organ is there. `bayesreg.model.observations.measured_surface` has the te
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 from jaxtyping import Bool, Float
+from pydantic import Field
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import pdist
 
@@ -22,10 +23,11 @@ from bayesreg.io.records import Inputs
 from bayesreg.io.surface_files import SUFFIXES, read_surface
 from bayesreg.mesh import TetMesh
 from bayesreg.model.blocks import Values, scale_block
-from bayesreg.model.observations.landmarks import ROBUST
+from bayesreg.model.observations.landmarks import MOST, ROBUST
 from bayesreg.model.observations.level_set import cell_table, distance_from_mask, distance_from_mesh, grid_around
 from bayesreg.model.observations.measured_surface import MeasuredSurface
 from bayesreg.model.observations.observation import Placed, Recorded
+from bayesreg.model.observations.odd_points import lie_near, other_readings, require_extent, suspect_reading
 from bayesreg.model.observations.point_noise import Noise
 from bayesreg.model.observations.section import Arrays, Name, ObservationSection, ReportFigure, ReportTable
 from bayesreg.model.observations.surface_report import describe_far_surface, height_figure, surface_table
@@ -88,7 +90,9 @@ class Surface:
     ) -> None:
         self.points = np.asarray(points, float)
         if self.points.ndim != 2 or self.points.shape[1] != 3 or len(self.points) < FEWEST:
-            raise InputError(f"{name}: expected {FEWEST} points or more of shape (k, 3), got {self.points.shape}")
+            raise InputError(
+                f"{name}: expected {FEWEST} points or more, in an array of shape (k, 3); got one of {self.points.shape}"
+            )
         if not np.isfinite(self.points).all():
             raise InputError(f"{name}: every coordinate must be a finite number")
         if (distinct := len(np.unique(self.points, axis=0))) < FEWEST:
@@ -132,12 +136,18 @@ class Surface:
         return Placed(self, term, {} if self.prior is None else {scale: scale_block(self.prior)})
 
     def _require_near(self, mesh: TetMesh) -> None:
-        """Raise InputError if most points lie further from the organ than half of its size."""
+        """Raise InputError if most points lie further from the organ than half of its size, or near it if read anew."""
+        require_extent(self.name, mesh, self.points)
+        grids = {} if self.tissue is None else {"the labels": self.tissue}
+        near = lie_near(mesh, self.points)
+        suspicion = suspect_reading(near, other_readings(mesh, self.points, grids))
         away = float(np.median(cKDTree(mesh.points).query(self.points)[0]))
-        if away > np.ptp(mesh.points, axis=0).max() / 2:
+        is_far = away > np.ptp(mesh.points, axis=0).max() / 2
+        if is_far or (suspicion and near.mean() < MOST):
+            question = "are they in mm, and in the coordinates of its image?"
             raise InputError(
-                f"{self.name}: half of its points lie more than {away:.0f} mm away from the organ; are they in mm, and "
-                "in the coordinates of its image? data.pose: unknown aligns a surface of other coordinates"
+                f"{self.name}: half of its points lie more than {away:.0f} mm away from the organ; "
+                f"{suspicion or question} data.pose: unknown aligns a surface of other coordinates"
             )
 
     def mask(self, tissue: Image, names: Sequence[str]) -> Image:
@@ -228,7 +238,7 @@ class SurfaceSection(ObservationSection):
     file: FoundFile
     """Points or a mesh of the surface in the space of the moving image (.ply, .stl, .vtk, .vtp, .obj, .csv, .fcsv,
     .mrk.json)."""
-    of: str | list[str] = BOUNDARY
+    of: str | Annotated[list[str], Field(min_length=1)] = BOUNDARY
     """The tissues whose common surface was measured; boundary is the surface of the whole organ."""
     sd: KnownOrInferred = UNKNOWN_SD
     """Sd of the error along the normal of the surface, mm, or its prior."""
