@@ -129,6 +129,10 @@ class ModeSearch(Protocol):
         """The names of hyperparameters on which, at a fixed "u_boundary", only `quadratic_part` depends."""
 
     @property
+    def followed(self) -> Sequence[str]:
+        """The names of hyperparameters that the displacements follow, because the data say little about them."""
+
+    @property
     def search_start(self) -> Estimands | None:
         """Estimands near the mode, where the search begins; None if it begins where the chains start."""
 

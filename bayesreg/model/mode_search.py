@@ -76,10 +76,19 @@ class ModeSearch:
         return tuple(name for name in self.hyperparameters if not (has_followers and name in LAME))
 
     @property
+    def followed(self) -> tuple[str, ...]:
+        """The hyperparameters that the sampled displacements follow: all of them if images say little of each place."""
+        return self.separable if self._is_weak and "field" not in self.data.blocks else ()
+
+    @property
+    def _is_weak(self) -> bool:
+        return any(getattr(pair, "is_weak", False) for pair in self.observations.values())
+
+    @property
     def loosening(self) -> dict[str, float]:
         """The factors on the sampled scales of the elastic prior; empty if no observation is weak."""
         elastic = self.data.terms.get("elastic")
-        if elastic is None or not any(getattr(pair, "is_weak", False) for pair in self.observations.values()):
+        if elastic is None or not self._is_weak:
             return {}
         return {name: LOOSE**power for name, power in elastic.powers.items() if self.data.blocks[name].is_sampled}
 

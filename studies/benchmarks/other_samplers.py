@@ -54,7 +54,6 @@ from bayesreg.inference.chains.run import sample
 from bayesreg.inference.draws.blocks import Block
 from bayesreg.inference.draws.diagnostics import worst
 from bayesreg.inference.gaussian.laplace import Gaussian
-from bayesreg.inference.gaussian.whitened import whiten
 from bayesreg.inference.layout import unravel
 from bayesreg.inference.target import estimands_of
 from bayesreg.io import store
@@ -184,7 +183,7 @@ def problems(posterior: Any, first: Checkpoint, places: np.ndarray) -> dict[str,
     """The problem in unconstrained coordinates, and in those of `hmc` after its warm-up."""
     gaussian, middle = first.setup.gaussian, unravel(posterior.target)(first.setup.middle)
     data = posterior.target.condition(estimands_of(posterior.target, posterior.data, middle))
-    xi = np.asarray(jax.vmap(partial(whiten, gaussian))(jnp.asarray(places)))
+    xi = np.asarray(jax.vmap(gaussian.whiten)(jnp.asarray(places)))
     return {
         "unconstrained": Problem(posterior, data, None, places, 0.008),
         "whitened": Problem(posterior, data, gaussian, xi, 2.4 / np.sqrt(xi.shape[1])),

@@ -22,7 +22,7 @@ from bayesreg.inference.deadline import Deadline
 from bayesreg.inference.gaussian.delayed_acceptance import with_delayed_acceptance
 from bayesreg.inference.gaussian.density import height_and_slope
 from bayesreg.inference.gaussian.hyperparameters import move_hyperparameters
-from bayesreg.inference.gaussian.laplace import Gaussian, average_gaussian, laplace, slope_at
+from bayesreg.inference.gaussian.laplace import Gaussian, average_gaussian, blank_gaussian, laplace, slope_at
 from bayesreg.inference.gaussian.modes import Modes, search_modes
 from bayesreg.inference.gaussian.normaliser import make_stand_in
 from bayesreg.inference.gaussian.warm_up import FIRST_STEP, Tuning, compile_transition, tune, with_step_size
@@ -30,7 +30,6 @@ from bayesreg.inference.gaussian.whitened import (
     Setup,
     Transition,
     setup_about,
-    whiten,
     whitened_density,
     whitened_position,
 )
@@ -83,7 +82,7 @@ class Walk:
     def init(self, data: Any, setup: Setup, estimands: Estimands) -> Any:
         """Make the state of a chain at estimands."""
         flat = flat_position(self.target, data, estimands)
-        return self.begin(whiten(setup.gaussian, flat), whitened_density(self.target, data, setup))
+        return self.begin(setup.gaussian.whiten(flat), whitened_density(self.target, data, setup))
 
     def step(self, data: Any, setup: Setup, key: AnyArray, state: Any) -> tuple[Any, Info]:
         """Move a chain by one transition of the kernel in whitened coordinates; return its state and what it cost."""
@@ -181,7 +180,7 @@ def about_gaussian(
 
     def blank() -> Setup:
         nothing = jnp.zeros(unknowns)
-        return setup_about(target, Gaussian(nothing, jnp.eye(unknowns)), nothing)
+        return setup_about(target, blank_gaussian(target), nothing)
 
     data = partial(_condition, target)
     sampler = Sampler(
@@ -211,7 +210,7 @@ def _warm_up(
     mode = np.asarray(gaussian.centre)
     target, stage = walk.target, _half(tuning)
     key_settle, key_tune = jax.random.split(key)
-    first = _setup_on_average(target, mode, points)
+    first = _setup_on_average(target, gaussian, mode, points)
     first = first._replace(stand_in=make_stand_in(target, first.gaussian, first.middle))
     data = surrogate_data(target, first)
     settled = tune(data, walk, first, points, key_settle, stage, per_chain=True, deadline=deadline)
@@ -219,7 +218,7 @@ def _warm_up(
         return settled
     points = settled[1]
     # The stand-in is accurate far about both middles.
-    second = _setup_on_average(target, mode, points)._replace(stand_in=first.stand_in)
+    second = _setup_on_average(target, settled[0].gaussian, mode, points)._replace(stand_in=first.stand_in)
     return tune(surrogate_data(target, second), walk, second, points, key_tune, stage, deadline=deadline)
 
 
@@ -239,22 +238,31 @@ def surrogate_data(target: Target, setup: Setup) -> Any:
     return data if target.surrogate is None else target.surrogate(data)
 
 
-def _setup_on_average(target: Target, mode: AnyArray, points: Any) -> Setup:
+def _setup_on_average(target: Target, gaussian: Gaussian, mode: AnyArray, points: Any) -> Setup:
     """Make the setup, without a stand-in, about the Gaussian averaged over the mode and the points of the chains.
 
-    Points at which the density has no finite slope are left out.
+    The displacements of the points follow the hyperparameters to the mode, as the given Gaussian has it. Points at
+    which the density has no finite slope are left out.
     """
     flats = np.asarray(jax.vmap(lambda point: flat_position(target, target.data, point))(points))
+    flats = [_at_centre(gaussian, flat) for flat in flats]
     sound = (flat for flat in flats if np.isfinite(flat).all() and np.isfinite(slope_at(target, flat)).all())
     places = [mode, *islice(sound, AVERAGED)]
     return setup_about(target, average_gaussian(target, places), np.mean(places, axis=0))
 
 
+def _at_centre(gaussian: Gaussian, flat: AnyArray) -> AnyArray:
+    """Move the hyperparameters that displacements follow to their values at the centre; the displacements follow."""
+    if gaussian.following is None:
+        return flat
+    return np.asarray(gaussian.place(gaussian.whiten(flat).at[gaussian.following.entries].set(0.0)))
+
+
 @partial(jax.jit, static_argnums=0)
 def _draw_independently(target: Target, data: Any, gaussian: Gaussian, key: AnyArray) -> dict[str, AnyArray]:
     """Draw estimands from a Gaussian, with draws as the leading axis."""
-    positions = gaussian.centre + jax.random.normal(key, (FIRST_DRAWS, len(gaussian.centre))) @ gaussian.factor.T
-    return jax.vmap(lambda flat: estimands_of(target, data, unravel(target)(flat)))(positions)
+    xi = jax.random.normal(key, (FIRST_DRAWS, len(gaussian.centre)))
+    return jax.lax.map(lambda xi: estimands_of(target, data, unravel(target)(gaussian.place(xi))), xi, batch_size=50)
 
 
 def _scatter_all(target: Target, modes: Modes, keys: AnyArray) -> Any:

@@ -113,6 +113,7 @@ def with_delayed_acceptance(target: Target, sampler: Sampler, walk: Walking) -> 
         position = whitened_position(target, setup.gaussian, kernel.position)
         estimands, log_jacobian = target.coordinates.constrain(data.exact, position)
         evaluation = target.evaluate_estimands(data.exact, estimands)
+        log_jacobian += setup.gaussian.log_jacobian(kernel.position)
         return Exact(evaluation, evaluation.logdensity + log_jacobian - kernel.logdensity)
 
     def init(data: ChainData, setup: Setup, estimands: Estimands) -> Delayed:

@@ -47,6 +47,11 @@ def mark_hyperparameters(target: Target) -> Bool[np.ndarray, "dimension"]:
     return marked(target, *(target.mode_search.hyperparameters if target.mode_search else ()))
 
 
+def mark_followed(target: Target) -> Bool[np.ndarray, "dimension"]:
+    """Mark the entries of a flat position that hold hyperparameters which the displacements follow."""
+    return marked(target, *(target.mode_search.followed if target.mode_search else ()))
+
+
 def balance_field(
     target: Placed,
     flat: Float[np.ndarray, "dimension"],

@@ -16,7 +16,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool
 
-from bayesreg.inference.gaussian.laplace import solve_upper
 from bayesreg.inference.gaussian.whitened import Setup, surrogate_density
 from bayesreg.inference.layout import marked
 from bayesreg.inference.target import Target
@@ -65,11 +64,14 @@ def move_hyperparameters(target: Target, data: Any, setup: Setup, key: AnyArray,
     (moved, _), _ = jax.lax.scan(propose, (flat, density(flat)), jax.random.split(key, PROPOSALS))
     # A loop over both places compiles the gradient once.
     heights, gradients = jax.lax.map(jax.value_and_grad(density), jnp.stack([flat, moved]))
-    # The factor is upper triangular: a change of the first entries changes only as many whitened coordinates.
-    first = entries[-1] + 1
-    change = solve_upper(setup.gaussian.factor[:first, :first], (moved - flat)[:first])
+    position = state.position + setup.gaussian.whiten(moved) - setup.gaussian.whiten(flat)
+    before, slope_before = jax.value_and_grad(setup.gaussian.log_jacobian)(state.position)
+    after, slope_after = jax.value_and_grad(setup.gaussian.log_jacobian)(position)
+    # The images' part of the slope in the flat position stays as it is.
+    (slope,) = jax.vjp(setup.gaussian.whiten, flat)[1](state.logdensity_grad - slope_before)
+    (slope,) = jax.vjp(setup.gaussian.place, position)[1](slope + gradients[1] - gradients[0])
     return state._replace(
-        position=state.position.at[:first].add(change),
-        logdensity=state.logdensity + heights[1] - heights[0],
-        logdensity_grad=state.logdensity_grad + setup.gaussian.pull_back(gradients[1] - gradients[0]),
+        position=position,
+        logdensity=state.logdensity + heights[1] - heights[0] + after - before,
+        logdensity_grad=slope + slope_after,
     )

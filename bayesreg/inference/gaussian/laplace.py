@@ -19,9 +19,10 @@ from bayesreg.inference.gaussian.density import (
     mark_normaliser,
     regular,
 )
-from bayesreg.inference.gaussian.evidence import volume_at
-from bayesreg.inference.gaussian.hierarchy import mark_hyperparameters, mark_scales
-from bayesreg.inference.layout import marked, unravel
+from bayesreg.inference.gaussian.evidence import change_of_curvature, volume_at
+from bayesreg.inference.gaussian.following import Following, follow_by, follow_nothing
+from bayesreg.inference.gaussian.hierarchy import mark_followed, mark_hyperparameters, mark_scales
+from bayesreg.inference.layout import dimension, marked, unravel
 from bayesreg.inference.target import Curvature, Target, without_normaliser
 from bayesreg.types import AnyArray, InputError
 
@@ -42,14 +43,36 @@ class Gaussian(NamedTuple):
     centre : (d,) array
     factor : (d, d) array
         An upper triangular matrix; the whitened coordinates are ξ = factor⁻¹ (x − centre).
+    following : Following or None
+        How the displacements, the last entries, follow hyperparameters. This precedes the product with the factor, and
+        what is placed is then no Gaussian.
     """
 
     centre: Float[AnyArray, "dimension"]
     factor: Float[AnyArray, "dimension dimension"]
+    following: Following | None = None
 
     def place(self, xi: AnyArray) -> AnyArray:
         """Map whitened coordinates ξ to a flat position."""
+        if self.following is not None:
+            first = len(xi) - len(self.following.mean)
+            xi = xi.at[first:].set(self.following.follow(self._change(xi[:first]), xi[first:]))
         return self.centre + _product(self.factor, xi)
+
+    def log_jacobian(self, xi: AnyArray) -> AnyArray:
+        """Compute the log determinant of `place`, up to a constant."""
+        if self.following is None:
+            return jnp.zeros(())
+        return self.following.log_jacobian(self._change(xi[: len(xi) - len(self.following.mean)]))
+
+    def _change(self, parameters: AnyArray) -> AnyArray:
+        """Map the whitened coordinates of all but the displacements to the change of the followed hyperparameters.
+
+        These are independent of the displacements, which are the last entries, in the upper triangular factor.
+        """
+        assert self.following is not None
+        first = len(parameters)
+        return _product(self.factor[:first, :first], parameters)[self.following.entries]
 
     def pull_back(self, slope: AnyArray) -> AnyArray:
         """Map a slope in the flat position to the slope in the whitened coordinates."""
@@ -57,11 +80,19 @@ class Gaussian(NamedTuple):
 
     def in_single_precision(self) -> Gaussian:
         """Return the Gaussian with its factor in single precision: it takes half the time to multiply."""
-        return self._replace(factor=jnp.asarray(self.factor, jnp.float32))
+        return jax.tree.map(_in_single_precision, self)._replace(centre=self.centre)
 
-    def whiten(self, change: AnyArray) -> AnyArray:
-        """Map a change of the flat position to the change of the whitened coordinates."""
-        return solve_upper(self.factor, change)
+    def whiten(self, flat: AnyArray) -> AnyArray:
+        """Map a flat position to whitened coordinates ξ."""
+        xi = solve_upper(self.factor, flat - self.centre)
+        if self.following is None:
+            return xi
+        first = len(xi) - len(self.following.mean)
+        return xi.at[first:].set(self.following.unfollow(self._change(xi[:first]), xi[first:]))
+
+
+def _in_single_precision(array: AnyArray) -> AnyArray:
+    return jnp.asarray(array, jnp.float32) if jnp.issubdtype(array.dtype, jnp.floating) else jnp.asarray(array)
 
 
 def _product(matrix: Float[AnyArray, "rows columns"], vector: Float[AnyArray, "columns"]) -> Float[AnyArray, "rows"]:
@@ -80,7 +111,25 @@ def solve_upper(matrix: Float[AnyArray, "rows rows"], vector: Float[AnyArray, "r
 
 def laplace(target: Target, flat: Float[np.ndarray, "dimension"], data: Any = None, joint: bool = True) -> Gaussian:
     """Make the Gaussian about a flat position with the curvature at it (see `precision_at`)."""
-    return gaussian_of(flat, precision_at(target, flat, data, joint))
+    gaussian = gaussian_of(flat, precision_at(target, flat, data, joint))
+    return let_follow(target, gaussian) if joint else gaussian
+
+
+def let_follow(target: Target, gaussian: Gaussian) -> Gaussian:
+    """Let the displacements of a Gaussian follow hyperparameters, if those of the target do (see `following`)."""
+    entries, rows = np.flatnonzero(mark_followed(target)), marked(target, "u_boundary")
+    if not len(entries):
+        return gaussian
+    centre, factor = np.asarray(gaussian.centre), np.asarray(gaussian.factor)
+    sds, change_at = np.linalg.norm(factor[entries], axis=1), change_of_curvature(target, centre)
+    return gaussian._replace(following=follow_by(entries, sds, factor[np.ix_(rows, rows)], centre[rows], change_at))
+
+
+def blank_gaussian(target: Target) -> Gaussian:
+    """Make a Gaussian N(0, I) of the shapes that all Gaussians of the target have."""
+    unknowns, entries = dimension(target), np.flatnonzero(mark_followed(target))
+    following = follow_nothing(entries, int(marked(target, "u_boundary").sum())) if len(entries) else None
+    return Gaussian(jnp.zeros(unknowns), jnp.eye(unknowns), following)
 
 
 def average_gaussian(target: Target, flats: Sequence[Float[np.ndarray, "dimension"]]) -> Gaussian:
@@ -99,7 +148,7 @@ def average_gaussian(target: Target, flats: Sequence[Float[np.ndarray, "dimensio
     approximate, remainder = (np.mean(matrices, axis=0) for matrices in zip(*pairs, strict=True))
     curvature = _add_convexly(regular(approximate), remainder)
     precision = _jointly(target, target.data, flats[0], curvature, joint=True, at_draws=True)
-    return recentre(target, gaussian_of(flats[0], precision), flats)
+    return let_follow(target, recentre(target, gaussian_of(flats[0], precision), flats))
 
 
 def recentre(target: Target, gaussian: Gaussian, flats: Sequence[Float[np.ndarray, "dimension"]]) -> Gaussian:
@@ -239,13 +288,19 @@ def _jointly(
     hyperparameters = np.flatnonzero(mark_hyperparameters(target)[entries])
     if len(hyperparameters):
         volume = volume_at(target, flat, curvature)
-        diagonal_block[np.ix_(hyperparameters, hyperparameters)] += volume.excess if at_draws else volume.curvature
+        # Where displacements follow, trajectories meet the curvature of the evidence.
+        is_met = at_draws and not mark_followed(target).any()
+        diagonal_block[np.ix_(hyperparameters, hyperparameters)] += volume.excess if is_met else volume.curvature
     inner = cross @ scipy.linalg.cho_solve(scipy.linalg.cho_factor(precision[np.ix_(curved, curved)]), cross.T)
     least = ravel_pytree(target.coordinates.least_curvature(data, unravel(target)(jnp.asarray(flat))))[0]
     unit = np.sqrt(np.asarray(least)[entries])
     values, vectors = np.linalg.eigh((diagonal_block - inner) / np.outer(unit, unit))
     vectors *= unit[:, None]
     convex = (vectors * np.maximum(np.abs(values), 1.0)) @ vectors.T
+    followed = mark_followed(target)[entries]
+    # Displacements that follow hyperparameters have coordinates that are independent of them.
+    cross[followed] = inner[followed] = inner[:, followed] = 0.0
+    convex[np.ix_(followed, ~followed)] = convex[np.ix_(~followed, followed)] = 0.0
     precision[np.ix_(entries, entries)] = convex + (inner + inner.T) / 2
     precision[np.ix_(entries, curved)], precision[np.ix_(curved, entries)] = cross, cross.T
     return precision

@@ -63,19 +63,19 @@ def setup_about(target: Target, gaussian: Gaussian, middle: AnyArray) -> Setup:
     return Setup(gaussian, jnp.asarray(middle), jnp.asarray(FIRST_STEP), jnp.asarray(1, int), no_stand_in(target))
 
 
-def whiten(gaussian: Gaussian, flat: AnyArray) -> AnyArray:
-    """Map a flat position to whitened coordinates ξ."""
-    return gaussian.whiten(flat - gaussian.centre)
-
-
 def whitened_position(target: Target, gaussian: Gaussian, xi: AnyArray) -> dict[str, AnyArray]:
     """Map whitened coordinates ξ to a position."""
     return unravel(target)(gaussian.place(xi))
 
 
 def whitened_density(target: Target, data: Any, setup: Setup) -> Callable[[AnyArray], AnyArray]:
-    """Make the function `surrogate_density` of whitened coordinates ξ."""
-    return lambda xi: surrogate_density(target, data, setup, setup.gaussian.place(xi))
+    """Make the log density of whitened coordinates ξ: `surrogate_density`, and the Jacobian of what follows."""
+
+    def density(xi: AnyArray) -> AnyArray:
+        height = surrogate_density(target, data, setup, setup.gaussian.place(xi))
+        return height + setup.gaussian.log_jacobian(xi)
+
+    return density
 
 
 def surrogate_density(target: Target, data: Any, setup: Setup, flat: AnyArray) -> AnyArray:
