@@ -66,7 +66,7 @@ class ModeSearch:
         self.data = data
 
     hyperparameters = ()
-    separable = ()
+    separable = followed = ()
     search_start = tempering = None
     loosening = MappingProxyType({})
 

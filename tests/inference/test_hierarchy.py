@@ -107,7 +107,7 @@ class Displaced:
 
     mode_search = coordinates
     hyperparameters = ("noise", "t_elastic")
-    separable = ()
+    separable = followed = ()
 
     def reference(self):
         return {"noise": jnp.ones(()), "t_elastic": jnp.ones(()), "u_boundary": jnp.zeros((MOVED // 3, 3))}
