@@ -144,7 +144,7 @@ def test_pairs_in_another_order_are_told(caplog):
     fixed, moving = pairs(30)
     placed(fixed, np.roll(moving, 7, axis=0))
     (sentence,) = caplog.messages
-    assert "are the fixed and the moving points in the same order?" in sentence
+    assert "Are the fixed and the moving points in the same order?" in sentence
 
 
 @pytest.mark.parametrize("kind", ["landmarks", "surface"])

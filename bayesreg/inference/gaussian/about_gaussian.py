@@ -245,8 +245,8 @@ def _setup_on_average(target: Target, gaussian: Gaussian, mode: AnyArray, points
     which the density has no finite slope are left out.
     """
     flats = np.asarray(jax.vmap(lambda point: flat_position(target, target.data, point))(points))
-    flats = [_at_centre(gaussian, flat) for flat in flats]
-    sound = (flat for flat in flats if np.isfinite(flat).all() and np.isfinite(slope_at(target, flat)).all())
+    centred = (_at_centre(gaussian, flat) for flat in flats)
+    sound = (flat for flat in centred if np.isfinite(flat).all() and np.isfinite(slope_at(target, flat)).all())
     places = [mode, *islice(sound, AVERAGED)]
     return setup_about(target, average_gaussian(target, places), np.mean(places, axis=0))
 

@@ -23,7 +23,7 @@ from bayesreg.inference.target import Target, estimands_of
 from bayesreg.types import AnyArray, Scalar
 
 # The degree of the polynomial is the highest one with at most MOST_TERMS terms: the cost of the fit grows with them.
-HIGHEST_DEGREE, MOST_TERMS = 4, 150
+HIGHEST_DEGREE, MOST_TERMS = 8, 150
 # The polynomial is fitted up to this distance from the middle, in standard deviations of the Gaussian: the posterior of
 # a parameter is wider than the Gaussian (see `average_gaussian`), and skew.
 REACH = 5.0

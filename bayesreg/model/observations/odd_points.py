@@ -27,7 +27,8 @@ FLAT = 0.05
 CLEARLY = 0.25
 # Points are a spot, as points in metres are, if they spread over less than this share of the size of the mesh.
 SPOT = 0.01
-# Pairs are in disorder if the best rigid motion leaves partners further apart than this share of the points' spread.
+# Pairs are in disorder if the best rigid motion leaves partners further apart than this share of the points' distance
+# from their centre, both in the median.
 DISORDER = 0.5
 
 
@@ -128,12 +129,13 @@ def describe_partners(
 ) -> list[str]:
     """Return a sentence if the moving points fit no motion, as in another order, or lie far from their partners."""
     away, moved = fixed - fixed.mean(axis=0), moving - moving.mean(axis=0)
-    left, spread = (length / np.sqrt(len(fixed)) for length in (_rigid_distance(away, moved), np.linalg.norm(away)))
+    # Medians, so that a wrong pair does not count as disorder.
+    left, spread = _median_distance(_turn(away, moved), moved), float(np.median(np.linalg.norm(away, axis=1)))
     if len(fixed) > 3 and left > DISORDER * spread:
         return [
-            f"{name}: the best rigid motion leaves the points {left:.0f} mm away from their partners (root mean "
-            f"square), and they lie {spread:.0f} mm around their centre; are the fixed and the moving points in the "
-            "same order?"
+            f"{name}: the best rigid motion leaves half of the points more than {left:.0f} mm away from their "
+            f"partners; half of them lie within {spread:.0f} mm of their centre. Are the fixed and the "
+            "moving points in the same order?"
         ]
     distance = _median_distance(moving, fixed)
     if distance > np.ptp(mesh.points, axis=0).max() / 2:
@@ -148,12 +150,12 @@ def _median_distance(points: Float[np.ndarray, "k 3"], others: Float[np.ndarray,
     return float(np.median(np.linalg.norm(points - others, axis=1)))
 
 
-def _rigid_distance(points: Float[np.ndarray, "k 3"], others: Float[np.ndarray, "k 3"]) -> float:
-    """Compute the root of the sum of squared distances that the best rotation leaves between points and others."""
+def _turn(points: Float[np.ndarray, "k 3"], others: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "k 3"]:
+    """Turn points by the rotation that brings them nearest to others."""
     with warnings.catch_warnings():
         # Points on a line have many best rotations, all with the same distance.
         warnings.simplefilter("ignore", UserWarning)
-        return float(Rotation.align_vectors(others, points)[1])
+        return Rotation.align_vectors(others, points)[0].apply(points)
 
 
 def first_of_each(fixed: Float[np.ndarray, "k 3"], moving: Float[np.ndarray, "k 3"]) -> Int[np.ndarray, "distinct"]:
