@@ -29,10 +29,10 @@ def follow_scales(data, priors, push):
     gaussian = gaussian_of(np.linalg.solve(precision, push), precision)
     factor, mean = np.asarray(gaussian.factor), np.asarray(gaussian.centre)
 
-    def change_at(entry, by):
-        return np.expm1(-2 * by) * priors[entry]
+    def prior_at(entry, by):
+        return sum(priors) + np.expm1(-2 * by) * priors[entry]
 
-    return factor, mean, follow_by(np.arange(len(priors)), np.ones(len(priors)), factor, mean, change_at)
+    return factor, mean, follow_by(np.arange(len(priors)), np.ones(len(priors)), factor, mean, prior_at)
 
 
 @pytest.mark.parametrize("change", [-2.0, -1.0, 0.0, 1.0, 2.0])
@@ -52,6 +52,15 @@ def test_one_scale_of_a_gaussian_prior_is_followed_exactly(change):
     root = np.asarray(jax.jacobian(place)(jnp.zeros(ROWS)))
     np.testing.assert_allclose(root @ root.T, expected, atol=1e-5 * np.abs(expected).max())
     np.testing.assert_allclose(place(jnp.zeros(ROWS)), expected @ push, atol=1e-4 * np.abs(mean).max())
+
+
+def test_images_that_curve_the_wrong_way_leave_a_precision():
+    prior = positive_definite(1)
+    _, _, following = follow_scales(-0.5 * prior, [prior], np.ones(ROWS))
+    changes = jnp.array([2.0])
+    # The precision of the prior alone.
+    np.testing.assert_allclose(following.log_jacobian(changes), 2.0 * ROWS, rtol=1e-3)
+    assert np.isfinite(following.follow(changes, jnp.ones(ROWS))).all()
 
 
 def test_the_inverse_and_the_jacobian_of_two_hyperparameters():

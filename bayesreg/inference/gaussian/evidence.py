@@ -221,10 +221,9 @@ def slopes_of_curvature(
     return slopes
 
 
-def change_of_curvature(target: Target, flat: Float[np.ndarray, "dimension"]) -> Callable[[int, float], Matrix]:
-    """Make the map from an entry of a flat position and its change to that of the curvature in u of all but images."""
-    here = _curvature(target, flat, flat)
-    return lambda entry, by: _curvature(target, _moved(flat, {entry: by}), flat) - here
+def curvature_without_images(target: Target, flat: Float[np.ndarray, "dimension"]) -> Callable[[int, float], Matrix]:
+    """Make the map from an entry of a flat position and its change to the curvature in u of all but the images."""
+    return lambda entry, by: _curvature(target, _moved(flat, {entry: by}), flat)
 
 
 def volume_at(

@@ -91,7 +91,7 @@ def follow_by(
     sds: Float[np.ndarray, "hyperparameters"],
     factor: Float[np.ndarray, "rows rows"],
     mean: Float[np.ndarray, "rows"],
-    change_at: Callable[[int, float], Matrix],
+    prior_at: Callable[[int, float], Matrix],
 ) -> Following:
     """Make the coordinates in which displacements follow hyperparameters.
 
@@ -104,27 +104,29 @@ def follow_by(
         F, upper triangular, where F Fᵀ = H⁻¹ is the covariance of the displacements at θ̂.
     mean : (r,) array
         The mean of the displacements at θ̂.
-    change_at : callable
-        (entry, δ) → the change of H if the hyperparameter changes by δ.
+    prior_at : callable
+        (entry, δ) → the prior's precision of the displacements if the hyperparameter changes by δ.
     """
     each = zip(entries.tolist(), sds.tolist(), strict=True)
-    parts = [_follow_one(sd, factor, partial(change_at, entry)) for entry, sd in each]
+    parts = [_follow_one(sd, factor, partial(prior_at, entry)) for entry, sd in each]
     directions, coefficients = (jnp.asarray(np.array(part)) for part in zip(*parts, strict=True))
     whitened = scipy.linalg.solve_triangular(factor, mean)
     return Following(jnp.asarray(entries), directions, coefficients, jnp.asarray(WIDEST * sds), jnp.asarray(whitened))
 
 
 def _follow_one(
-    sd: float, factor: Float[np.ndarray, "rows rows"], change_at: Callable[[float], Matrix]
+    sd: float, factor: Float[np.ndarray, "rows rows"], prior_at: Callable[[float], Matrix]
 ) -> tuple[Float[np.ndarray, "rows rows"], Float[np.ndarray, "powers rows"]]:
     """Return the directions of one hyperparameter, and the coefficients of log h."""
     places, width = sd * np.array(PLACES), WIDEST * sd
-    changes = [change_at(place) for place in places]
+    priors = [prior_at(place) for place in (0.0, *places)]
     # Single precision halves the time, and these arrays are rounded to it anyway.
-    between = (factor.T @ ((changes[1] - changes[0]) @ factor)).astype(np.float32)
+    between = (factor.T @ ((priors[2] - priors[1]) @ factor)).astype(np.float32)
     directions = scipy.linalg.eigh(between, overwrite_a=True, check_finite=False)[1].astype(float)
     steps = factor @ directions
-    log_precisions = np.log1p([np.einsum("ji,ji->i", steps, change @ steps) for change in changes])
+    at_centre, *values = (np.einsum("ji,ji->i", steps, prior @ steps) for prior in priors)
+    # The curvature of images may be negative where they fit badly. The prior's share of H then exceeds 1.
+    log_precisions = np.log1p((np.array(values) - at_centre) / np.maximum(at_centre, 1.0))
     powers = (width * np.tanh(places / width))[:, None] ** np.arange(1, 1 + len(places))
     return directions, np.linalg.solve(powers, log_precisions)
 

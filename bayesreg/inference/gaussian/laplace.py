@@ -19,7 +19,7 @@ from bayesreg.inference.gaussian.density import (
     mark_normaliser,
     regular,
 )
-from bayesreg.inference.gaussian.evidence import change_of_curvature, volume_at
+from bayesreg.inference.gaussian.evidence import curvature_without_images, volume_at
 from bayesreg.inference.gaussian.following import Following, follow_by, follow_nothing
 from bayesreg.inference.gaussian.hierarchy import mark_followed, mark_hyperparameters, mark_scales
 from bayesreg.inference.layout import dimension, marked, unravel
@@ -121,8 +121,8 @@ def let_follow(target: Target, gaussian: Gaussian) -> Gaussian:
     if not len(entries):
         return gaussian
     centre, factor = np.asarray(gaussian.centre), np.asarray(gaussian.factor)
-    sds, change_at = np.linalg.norm(factor[entries], axis=1), change_of_curvature(target, centre)
-    return gaussian._replace(following=follow_by(entries, sds, factor[np.ix_(rows, rows)], centre[rows], change_at))
+    sds, prior_at = np.linalg.norm(factor[entries], axis=1), curvature_without_images(target, centre)
+    return gaussian._replace(following=follow_by(entries, sds, factor[np.ix_(rows, rows)], centre[rows], prior_at))
 
 
 def blank_gaussian(target: Target) -> Gaussian:
