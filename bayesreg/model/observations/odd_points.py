@@ -128,9 +128,8 @@ def describe_partners(
     name: str, mesh: TetMesh, fixed: Float[np.ndarray, "k 3"], moving: Float[np.ndarray, "k 3"]
 ) -> list[str]:
     """Return a sentence if the moving points fit no motion, as in another order, or lie far from their partners."""
-    away, moved = fixed - fixed.mean(axis=0), moving - moving.mean(axis=0)
-    # Medians, so that a wrong pair does not count as disorder.
-    left, spread = _median_distance(_turn(away, moved), moved), float(np.median(np.linalg.norm(away, axis=1)))
+    left, spread = _median_distance(_moved_rigidly(fixed, moving), moving), _median_distance(fixed, fixed.mean(axis=0))
+    # Medians, so that a wrong pair does not count as disorder; two or three points follow any others nearly.
     if len(fixed) > 3 and left > DISORDER * spread:
         return [
             f"{name}: the best rigid motion leaves half of the points more than {left:.0f} mm away from their "
@@ -146,16 +145,19 @@ def describe_partners(
     return []
 
 
-def _median_distance(points: Float[np.ndarray, "k 3"], others: Float[np.ndarray, "k 3"]) -> float:
+def _median_distance(points: Float[np.ndarray, "k 3"], others: Float[np.ndarray, "*k 3"]) -> float:
     return float(np.median(np.linalg.norm(points - others, axis=1)))
 
 
-def _turn(points: Float[np.ndarray, "k 3"], others: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "k 3"]:
-    """Turn points by the rotation that brings them nearest to others."""
+def _moved_rigidly(points: Float[np.ndarray, "k 3"], others: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "k 3"]:
+    """Move points by the rigid motion that brings them nearest to others; one point only shifts."""
+    away, others_away = points - points.mean(axis=0), others - others.mean(axis=0)
+    if len(points) == 1:
+        return others
     with warnings.catch_warnings():
         # Points on a line have many best rotations, all with the same distance.
         warnings.simplefilter("ignore", UserWarning)
-        return Rotation.align_vectors(others, points)[0].apply(points)
+        return Rotation.align_vectors(others_away, away)[0].apply(away) + others.mean(axis=0)
 
 
 def first_of_each(fixed: Float[np.ndarray, "k 3"], moving: Float[np.ndarray, "k 3"]) -> Int[np.ndarray, "distinct"]:

@@ -144,10 +144,10 @@ class Surface:
         away = float(np.median(cKDTree(mesh.points).query(self.points)[0]))
         is_far = away > np.ptp(mesh.points, axis=0).max() / 2
         if is_far or (suspicion and near.mean() < MOST):
-            question = "are they in mm, and in the coordinates of its image?"
+            question = "are they in mm, and in the coordinates of its image"
             raise InputError(
                 f"{self.name}: half of its points lie more than {away:.0f} mm away from the organ; "
-                f"{suspicion or question} data.pose: unknown aligns a surface of other coordinates"
+                f"{suspicion or question}; data.pose: unknown aligns a surface of other coordinates"
             )
 
     def mask(self, tissue: Image, names: Sequence[str]) -> Image:
