@@ -17,10 +17,11 @@ from bayesreg.inference.layout import flat_position
 from bayesreg.model.coordinates import complete
 from bayesreg.model.observations.images.independence import (
     excess_of_patches,
+    independent_blocks,
     independent_points,
     independent_scores,
 )
-from bayesreg.model.term import PointCurvature
+from bayesreg.model.term import PointCurvature, SharedCurvature
 from bayesreg.types import InputError
 from tests.options import posterior_of
 from tests.phantoms import ball_mesh, rotated_affine, smooth_image
@@ -47,6 +48,45 @@ def field(width, seed=0):
     """White noise smoothed by a Gaussian of sd `width` mm: ρ(h) = exp(−h² / 4 width²)."""
     noise = np.random.default_rng(seed).normal(size=SHAPE)
     return 0.3 + 2 * ndimage.gaussian_filter(noise, width / SIZES, mode="wrap", truncate=6)
+
+
+def curvature_of(slopes, groups):
+    """The curvature of unit noise whose mean in each group is integrated out."""
+    size = np.bincount(groups)[groups]
+    shared = SharedCurvature(groups, (slopes / np.sqrt(size)[:, None])[None], -np.ones(1))
+    nothing = np.zeros((len(slopes), 4))
+    return PointCurvature(nothing.astype(int), nothing, slopes[:, :, None] * slopes[:, None], shared)
+
+
+@pytest.mark.parametrize(("repeats", "expected"), [(1, 1.0), (4, 0.25)])
+def test_blocks_count_how_often_noise_repeats(repeats, expected):
+    """Noise that is equal at `repeats` neighbours, where slopes are equal, too, counts once for all of them."""
+    rng, groups = np.random.default_rng(0), np.arange(64_000) // 64
+    slopes = np.repeat(rng.normal(size=(64_000 // repeats, 3)), repeats, axis=0)
+    noise = np.repeat(rng.normal(size=64_000 // repeats), repeats)
+    noise -= (np.bincount(groups, weights=noise) / 64)[groups]
+    share = independent_blocks(noise[:, None] * slopes, curvature_of(slopes, groups), groups // 4)
+    assert share == pytest.approx(expected, rel=0.1)
+
+
+def test_blocks_ignore_forces_that_cancel_within_them():
+    """The product of noise and its own gradient is a gradient, whose sum over a block is small."""
+    rng, groups = np.random.default_rng(0), np.arange(64_000) // 64
+    slopes = rng.normal(size=(64_000, 3))
+    noise = rng.normal(size=64_000)
+    noise -= (np.bincount(groups, weights=noise) / 64)[groups]
+    forces = noise[:, None] * slopes
+    own = rng.normal(size=(32_000, 1))
+    cancelling = 5 * np.stack([own, -own], axis=1).reshape(-1, 1) * np.ones(3)
+    assert (cancelling**2).sum() > 10 * (forces**2).sum()
+    share = independent_blocks(forces + cancelling, curvature_of(slopes, groups), groups // 4)
+    assert share == pytest.approx(1, rel=0.1)
+
+
+def test_no_force_is_an_error():
+    slopes = np.ones((8, 3))
+    with pytest.raises(InputError, match="residual is zero"):
+        independent_blocks(0 * slopes, curvature_of(slopes, np.zeros(8, int)), np.zeros(8, int))
 
 
 @pytest.mark.parametrize("width", [1.6, 2.5])

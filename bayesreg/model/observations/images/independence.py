@@ -105,6 +105,41 @@ def independent_scores(
     return float(np.clip(len(voxels) / share, 1, len(voxels)))
 
 
+def independent_blocks(
+    forces: Float[np.ndarray, "points 3"], points: PointCurvature, blocks: Int[np.ndarray, "points"]
+) -> float:
+    """Compute the variance of the forces on blocks in the model over their mean square.
+
+    In the model, the force on a block, which is the gradient of the log likelihood in a shift of the block, has the
+    covariance A_b, its expected curvature. The result is Σ_b tr A_b / Σ_b |g_b|². Noise that is correlated within a
+    block, and the gradient of noise in m, of which the sum over a block is small, count with the part that is left in
+    the sum. (It is the ratio of curvature to the variance of scores of clusters: Ribatet, Cooley and Davison 2012.)
+
+    Parameters
+    ----------
+    forces : (q, 3) array
+        The gradient of the log likelihood in the displacement of each point, 1/mm.
+    points : PointCurvature
+        The Gauss–Newton curvature of the same likelihood.
+    blocks : (q,) int array
+        The block of each point; every group of the shared curvature lies within one block.
+
+    Raises
+    ------
+    InputError
+        If all forces are zero.
+    """
+    force = np.stack([np.bincount(blocks, weights=component) for component in forces.T])
+    if not force.any():
+        raise InputError("the residual is zero at every point: nothing tells how it is correlated")
+    trace = float(np.asarray(points.matrices).trace(axis1=1, axis2=2).sum())
+    if points.shared is not None:
+        groups = np.asarray(points.shared.groups)
+        for sign, vectors in zip(np.asarray(points.shared.signs), np.asarray(points.shared.vectors), strict=True):
+            trace += float(sign) * sum((np.bincount(groups, weights=vector) ** 2).sum() for vector in vectors.T)
+    return trace / float((force**2).sum())
+
+
 def excess_of_patches(
     forces: Float[np.ndarray, "points 3"], points: PointCurvature, curvature: Float[np.ndarray, "unknowns unknowns"]
 ) -> float:

@@ -17,7 +17,7 @@ from numpyro.distributions import constraints
 from bayesreg.fem.elements import Quadrature
 from bayesreg.interpolation import Interpolator
 from bayesreg.model.blocks import Values
-from bayesreg.model.observations.images.independence import excess_of_patches
+from bayesreg.model.observations.images.independence import excess_of_patches, independent_blocks
 from bayesreg.model.observations.images.pointwise import Intensities, Pointwise, ValueCurvature
 from bayesreg.model.observations.images.self_similarity import AlternatingImages
 from bayesreg.model.observations.images.similarity import Similarity
@@ -168,15 +168,11 @@ class ComparedImages(NamedTuple):
         """Return −∂E_s/∂x at every point x_q + u(x_q): the force of the images there."""
         return _scores(self, u, dict(values))
 
-    def information_share(self, u: Float[AnyArray, "nodes 3"], values: Values) -> float:
-        """Return the expected curvature over the mean square of the scores; one if m has no noise of its own.
-
-        The gradient of the noise of m adds to the variance of the scores, and tells nothing about the displacement.
-        """
-        if self.similarity.expected_slope(self.compared(self.places(u), values)) is None:
-            return 1.0
-        curvature = self.gauss_newton(u, values).matrices.trace(axis1=1, axis2=2).sum() / self.independent_share
-        return float(curvature * self.temperature(values) ** 2 / (self.scores(u, values) ** 2).sum())
+    def count_by_blocks(self, u: Float[AnyArray, "nodes 3"], values: Values) -> float:
+        """Count the independent points from the forces on the blocks of the similarity, see `independent_blocks`."""
+        forces = np.asarray(self.scores(u, values)) * float(self.independent_share / self.temperature(values))
+        share = independent_blocks(forces, self.gauss_newton(u, values), np.asarray(self.similarity.blocks))
+        return float(np.clip(share * self.independent_points, 1.0, len(self.positions)))
 
     @property
     def is_pointwise(self) -> bool:

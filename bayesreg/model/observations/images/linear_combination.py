@@ -27,7 +27,7 @@ from typing import Any, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from bayesreg.interpolation import Interpolator
 from bayesreg.model.observations.images.local_correlation import Windows, windows_of
@@ -50,6 +50,9 @@ RIDGE = 0.01
 NEARLY_NONE = 1e-3
 # The side of a patch in sds of the smoothing of the images: in less, three coefficients explain any smooth image.
 PATCH = 10.0
+# The side of a block in sides of a patch: the scale on which images determine displacements. Forces on patches are
+# correlated with those on their neighbours.
+BLOCK = 2.5
 # s² as a share of the variance of m: less than the noise of ultrasound.
 FLOOR = 0.05
 
@@ -90,6 +93,8 @@ class PatchRegression(NamedTuple):
     Attributes
     ----------
     patches : Windows
+    blocks : (q,) int array
+        The block of each point; a block is several neighbouring patches.
     functions : (q, 2) array
         f and |∇f| at the points, each with mean zero and variance one.
     slopes : (q, 2, 3) array
@@ -103,6 +108,7 @@ class PatchRegression(NamedTuple):
     """
 
     patches: Windows
+    blocks: Int[AnyArray, "points"]
     functions: Float[AnyArray, "points 2"]
     slopes: Float[AnyArray, "points 2 3"]
     floor: Scalar
@@ -295,6 +301,7 @@ def regression_at(
     sd = jnp.maximum(functions.std(axis=0), 1e-12)
     return PatchRegression(
         windows_of(positions, window),
+        windows_of(positions, BLOCK * window).label,
         (functions - functions.mean(axis=0)) / sd,
         slopes / sd[:, None],
         floor,

@@ -269,10 +269,14 @@ class PreparedPair:
         return self.options.independent_points == "residual"
 
     def count_independent_points(self, term: ComparedImages, u: Float[AnyArray, "nodes 3"], values: Values) -> float:
-        """Count the independent quadrature points, from the residuals at these values (see `independent_scores`)."""
+        """Count the independent quadrature points, from the residuals at these values.
+
+        See `independent_scores` and, where m has a gradient of its own, `independent_blocks`.
+        """
+        if self.options.similarity.has_noisy_slopes:
+            return term.count_by_blocks(u, values)
         voxels = np.rint(self.fixed.world_to_voxel(np.asarray(term.positions))).astype(int)
-        count = independent_scores(np.asarray(term.scores(u, values)), voxels, self.fixed)
-        return max(count * term.information_share(u, values), 1.0)
+        return independent_scores(np.asarray(term.scores(u, values)), voxels, self.fixed)
 
 
 @dataclass(frozen=True, eq=False)
