@@ -27,7 +27,7 @@ NODES = np.arange(0, len(MESH.boundary), 3)
 # The number of data sets at a time: their data fit into the cache, which is four times as fast as all at once.
 BATCH = 20
 
-PARAMETERS = ("lam", "mu", "t_similarity", "t_elastic", "body_load", "surface_load")
+PARAMETERS = ("lam", "mu", "t_similarity", "t_elastic", "body_load", "surface_load", "images_shading")
 
 Estimands = dict[str, Any]
 
@@ -36,7 +36,13 @@ def quantity_names(posterior: br.Posterior) -> tuple[str, ...]:
     """The names of the test quantities: parameters, some displacements, E_s and the log density."""
     labels, blocks = posterior.target.variables.entry_names, posterior.data.blocks
     entries = [f"{name} {labels[i]}" for name in LAME for i in blocks[name].free.index]
-    warm = [name for name in PARAMETERS if name not in LAME and name in blocks and blocks[name].is_sampled]
+    sizes = {name: np.size(posterior.reference()[name]) for name in PARAMETERS if name not in LAME and name in blocks}
+    warm = [
+        name if size == 1 else f"{name} {i}"
+        for name, size in sizes.items()
+        if blocks[name].is_sampled
+        for i in range(size)
+    ]
     nodes = [f"u{posterior.sampled[node]} {axis}" for node in NODES for axis in "xyz"]
     return (*entries, *warm, *nodes, "E_s", "log p")
 

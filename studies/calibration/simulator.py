@@ -3,7 +3,8 @@
 (λ, μ, T_s, T_r) come from their priors. u_B comes from a Gaussian whose precision is S / T_r, with the Schur complement
 S of K, plus the precision of `rigid_sd` in the six rigid motions, which S leaves free. f_q is m(x_q + u(x_q)) plus
 noise of the squared scale T_s / (2 w_q). With random loads, whose sizes come from their priors, the displacements of
-all nodes have the precision K D⁻¹ K in place of S / T_r, and the noise is Student's t. The skull belongs to the
+all nodes have the precision K D⁻¹ K in place of S / T_r, and the noise is Student's t. A shading with Normal
+coefficients is subtracted from m, and where m is ignored, f_q is any intensity that f has. The skull belongs to the
 likelihood: a draw (λ, μ, u) with nodes in the skull is rejected. The prior is drawn by the oracle's matrices and NumPy,
 and shares no code with the density under test.
 """
@@ -24,7 +25,8 @@ import bayesreg as br
 from bayesreg.inference.target import without_normaliser
 from bayesreg.mesh import TetMesh
 from bayesreg.model import target
-from tests.options import posterior_of
+from bayesreg.model.observations.images.intensity_map import SHARE
+from tests.options import image_options_of, model_of
 from tests.oracles import paper
 from tests.phantoms import box_mesh, flat_skull, smooth_image
 
@@ -39,6 +41,8 @@ DEGREES_OF_FREEDOM = 4.0
 LOG_SD = 0.5
 PRIOR = {"alpha": 3.0, "beta": 3.0, "high": 4.0}
 WALL, WIDTH = 20.8, 0.1
+# mm: of the box of 20 mm, the moving image is ignored below it.
+IGNORED = 5.0
 
 
 class Variant(NamedTuple):
@@ -53,6 +57,8 @@ class Variant(NamedTuple):
     loads : bool
         Random loads on all nodes in place of exp(−E_r / T_r), and Student's t noise; their sizes and T_s are inferred,
         and μ of one tissue is known.
+    shaded : bool
+        Whether a shading of degree one is inferred, and a part of the moving image is ignored.
     surrogate : bool
         Whether the few nodes are treated like many: trajectories then see the surrogate of the density.
     """
@@ -60,6 +66,7 @@ class Variant(NamedTuple):
     skull: bool = False
     temperatures: bool = False
     loads: bool = False
+    shaded: bool = False
     surrogate: bool = False
 
     @property
@@ -75,6 +82,8 @@ class Variant(NamedTuple):
         elastic: dict[str, Any] = {"t_elastic": T_ELASTIC, "normalised": True}
         if self.loads:
             elastic = {"similarity": "student_t", "degrees_of_freedom": DEGREES_OF_FREEDOM}
+        if self.shaded:
+            elastic["intensity_map"] = 1
         return {
             "fixed": {"mu": {"gm": 2.0}} if self.inferred else {},
             "priors": dict.fromkeys(LAME, PRIOR),
@@ -93,6 +102,7 @@ VARIANTS = {
     "skull": Variant(skull=True),
     "temperatures": Variant(temperatures=True),
     "loads": Variant(loads=True),
+    "loads, shading and mask": Variant(loads=True, shaded=True),
     "loads with surrogate": Variant(loads=True, surrogate=True),
 }
 
@@ -111,9 +121,12 @@ def require_treatment(variant: Variant, posterior: br.Posterior) -> None:
 def calibrated(variant: Variant, **planted: Any) -> br.Posterior:
     """The density under test; `planted` are options that are wrong on purpose."""
     moving = smooth_image(MESH.points, seed=1, blur=2.0)
+    ignored = moving.with_voxels(moving.grid_points()[..., 0] < IGNORED) if variant.shaded else None
     skull = flat_skull(MESH.points, axis=0, wall=WALL, voxel=1.0) if variant.skull else None
+    options = variant.options | planted
     # The fixed image is replaced at the quadrature points, one replication after another.
-    return posterior_of(moving, moving, MESH, skull, **variant.options | planted)
+    pair = br.ImagePair(moving, moving, moving_ignore=ignored, **image_options_of(**options))
+    return br.build_posterior(MESH, [pair], model_of(**options), skull)
 
 
 class Simulator:
@@ -192,6 +205,8 @@ class Simulator:
             values[name][free] = PRIOR["high"] * rng.beta(PRIOR["alpha"], PRIOR["beta"], len(free))
         for name, median in self.variant.inferred.items():
             values[name] = median * np.exp(LOG_SD * rng.normal())
+        if self.variant.shaded:
+            values["images_shading"] = SHARE * rng.normal(size=len(self.posterior.reference()["images_shading"]))
         return values
 
     def draw_prior(self, rng: np.random.Generator, count: int) -> dict[str, np.ndarray]:
@@ -215,10 +230,21 @@ def draw_data(posterior: br.Posterior, data: Any, key: Any, estimands: Any) -> A
         data.terms["images"],
     )
     t_similarity = estimands.get("t_similarity", data.blocks["t_similarity"].reference())
+    key_noise, key_choice, key_any = jax.random.split(key, 3)
+    heavy = isinstance(posterior.observations["images"].options.similarity, br.StudentT)
+
+    def noise(key: Any, scale: Any) -> Any:
+        return scale * (
+            jax.random.t(key, DEGREES_OF_FREEDOM, scale.shape) if heavy else jax.random.normal(key, scale.shape)
+        )
+
     scale = jnp.sqrt(t_similarity / (2 * images.quadrature.weights))
-    if isinstance(posterior.observations["images"].options.similarity, br.StudentT):
-        return images.predicted(u) + scale * jax.random.t(key, DEGREES_OF_FREEDOM, scale.shape)
-    return images.predicted(u) + scale * jax.random.normal(key, scale.shape)
+    seen = images.predicted(u, estimands) + noise(key_noise, scale)
+    if images.visible is None:
+        return seen
+    f = images.fixed_values
+    hidden = f.mean() + noise(key_any, jnp.sqrt(scale**2 + f.var()))
+    return jnp.where(jax.random.uniform(key_choice, f.shape) < images.visible(images.places(u)), seen, hidden)
 
 
 def observing(data: Any, fixed_values: Any) -> Any:

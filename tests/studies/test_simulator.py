@@ -13,6 +13,8 @@ from scipy import stats
 from bayesreg.fem.elasticity import rigid_modes, stiffness
 from studies.calibration.chains import simulated
 from studies.calibration.simulator import (
+    DEGREES_OF_FREEDOM,
+    IGNORED,
     MESH,
     PRIOR,
     RIGID_SD,
@@ -128,3 +130,27 @@ def test_the_skull_lets_as_many_pass_as_its_density_says():
     deepest = np.maximum(MESH.points[MESH.boundary, 0] + accepted["u_boundary"][..., 0] - WALL, 0.0).max(axis=1)
     assert 0.1 < weights.mean() < 0.8
     assert abs(deepest.mean() - mean) < 5 * deepest.std() / np.sqrt(len(deepest) / 2)
+
+
+def test_shaded_data_are_any_intensity_where_the_moving_image_is_ignored():
+    """By the oracle's splines and SciPy's t, with the box's corner of the mask and the shading written out."""
+    shaded = simulator("loads, shading and mask")
+    posterior, draws = shaded.posterior, shaded.draw_prior(np.random.default_rng(6), 24)
+    observed = np.asarray(simulated(posterior, posterior.data, draws, jax.random.key(0)))
+    cells, barycentric, weights = paper.mesh_rule(MESH.points, MESH.cells, "gauss4")
+    moving, images, seen, hidden = posterior.observations["images"].moving, posterior.data.terms["images"], [], []
+    original = posterior.observations["images"].fixed
+    rest = paper.interpolate(original.voxels, original.affine, np.asarray(images.positions), "cubic")
+    for i, f in enumerate(observed):
+        moved = np.einsum("qa,qai->qi", barycentric, (MESH.points + draws["u_boundary"][i])[MESH.cells[cells]])
+        sd = np.sqrt(draws["t_similarity"][i] / (2 * weights))
+        m = paper.interpolate(moving.voxels, moving.affine, moved, "cubic")
+        m = m - np.asarray(images.shading) @ draws["images_shading"][i]
+        # One voxel beyond the ignored ones is ignored, too, and interpolation is half-way to the next.
+        away = 2.5 * moving.voxel_sizes.max()
+        far, near = moved[:, 0] > IGNORED + away, moved[:, 0] < IGNORED
+        seen.append(((f - m) / sd)[far])
+        hidden.append(((f - rest.mean()) / np.sqrt(sd**2 + rest.var()))[near])
+    for values in (seen, hidden):
+        assert len(np.concatenate(values)) > 200
+        assert stats.kstest(np.concatenate(values), stats.t(DEGREES_OF_FREEDOM).cdf).pvalue > 1e-3

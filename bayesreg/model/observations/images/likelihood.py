@@ -168,10 +168,10 @@ class ComparedImages(NamedTuple):
         """Return −∂E_s/∂x at every point x_q + u(x_q): the force of the images there."""
         return _scores(self, u, dict(values))
 
-    def count_by_blocks(self, u: Float[AnyArray, "nodes 3"], values: Values) -> float:
-        """Count the independent points from the forces on the blocks of the similarity, see `independent_blocks`."""
+    def count_by_blocks(self, u: Float[AnyArray, "nodes 3"], values: Values, blocks: Int[AnyArray, "points"]) -> float:
+        """Count the independent points from the forces on blocks of points, see `independent_blocks`."""
         forces = np.asarray(self.scores(u, values)) * float(self.independent_share / self.temperature(values))
-        share = independent_blocks(forces, self.gauss_newton(u, values), np.asarray(self.similarity.blocks))
+        share = independent_blocks(forces, self.gauss_newton(u, values), np.asarray(blocks))
         return float(np.clip(share * self.independent_points, 1.0, len(self.positions)))
 
     @property

@@ -23,6 +23,7 @@ from bayesreg.model.observations.images.discrepancies import discrepancies
 from bayesreg.model.observations.images.independence import independent_scores
 from bayesreg.model.observations.images.intensity_map import SHARE, shading_basis
 from bayesreg.model.observations.images.likelihood import ComparedImages, Comparison, shading_name
+from bayesreg.model.observations.images.linear_combination import PatchRegression
 from bayesreg.model.observations.images.options import ImageOptions
 from bayesreg.model.observations.images.points import (
     is_seen,
@@ -271,10 +272,10 @@ class PreparedPair:
     def count_independent_points(self, term: ComparedImages, u: Float[AnyArray, "nodes 3"], values: Values) -> float:
         """Count the independent quadrature points, from the residuals at these values.
 
-        See `independent_scores` and, where m has a gradient of its own, `independent_blocks`.
+        See `independent_scores` and, for linear combinations in patches, `independent_blocks`.
         """
-        if self.options.similarity.has_noisy_slopes:
-            return term.count_by_blocks(u, values)
+        if isinstance(term.similarity, PatchRegression):
+            return term.count_by_blocks(u, values, term.similarity.blocks)
         voxels = np.rint(self.fixed.world_to_voxel(np.asarray(term.positions))).astype(int)
         return independent_scores(np.asarray(term.scores(u, values)), voxels, self.fixed)
 
