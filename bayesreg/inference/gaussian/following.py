@@ -80,7 +80,7 @@ class Following(NamedTuple):
         return -self._log_precisions(change).sum() / 2
 
     def _log_precisions(self, change: AnyArray) -> Float[AnyArray, "hyperparameters rows"]:
-        """Compute log h."""
+        """Compute log h of every hyperparameter and direction at a change of the hyperparameters."""
         x = self.widths * jnp.tanh(change.astype(self.widths.dtype) / self.widths)
         powers = x[:, None] ** jnp.arange(1, 1 + self.coefficients.shape[1])
         return jnp.einsum("kp,kpr->kr", powers, self.coefficients)

@@ -108,12 +108,12 @@ def independent_scores(
 def independent_blocks(
     forces: Float[np.ndarray, "points 3"], points: PointCurvature, blocks: Int[np.ndarray, "points"]
 ) -> float:
-    """Compute the variance of the forces on blocks in the model over their mean square.
+    """Compute the ratio of the squared forces on blocks that the model expects to those that are there.
 
     In the model, the force on a block, which is the gradient of the log likelihood in a shift of the block, has the
-    covariance A_b, its expected curvature. The result is Σ_b tr A_b / Σ_b |g_b|². Noise that is correlated within a
-    block, and the gradient of noise in m, of which the sum over a block is small, count with the part that is left in
-    the sum. (It is the ratio of curvature to the variance of scores of clusters: Ribatet, Cooley and Davison 2012.)
+    covariance A_b, its expected curvature. The result is Σ_b tr A_b / Σ_b |g_b|². The sum over a block keeps noise that
+    is correlated, and loses the gradient of noise in m but for the border of the block. (For the ratio of curvature to
+    the variance of scores see Ribatet, Cooley and Davison 2012.)
 
     Parameters
     ----------

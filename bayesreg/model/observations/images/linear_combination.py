@@ -50,8 +50,8 @@ RIDGE = 0.01
 NEARLY_NONE = 1e-3
 # The side of a patch in sds of the smoothing of the images: in less, three coefficients explain any smooth image.
 PATCH = 10.0
-# The side of a block in sides of a patch: the scale on which images determine displacements. Forces on patches are
-# correlated with those on their neighbours.
+# The longest side of a block in sides of a patch: the scale on which images determine displacements. Forces on patches
+# are correlated with those on their neighbours.
 BLOCK = 2.5
 # s² as a share of the variance of m: less than the noise of ultrasound.
 FLOOR = 0.05
